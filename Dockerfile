@@ -23,8 +23,9 @@ COPY cfx ./cfx
 COPY conf ./conf
 COPY plugins/cfx-dask ./plugins/cfx-dask
 COPY plugins/cfx-recordings ./plugins/cfx-recordings
+COPY plugins/cfx-report ./plugins/cfx-report
 ARG EXTRAS=dask,joblib,postgresql,s3
-RUN /opt/cfx/bin/pip install --no-cache-dir --constraint constraints.txt ".[$EXTRAS]" ./plugins/cfx-dask ./plugins/cfx-recordings
+RUN /opt/cfx/bin/pip install --no-cache-dir --constraint constraints.txt ".[$EXTRAS]" ./plugins/cfx-dask ./plugins/cfx-recordings ./plugins/cfx-report
 
 FROM python:${PYTHON}-slim-bookworm
 # hadolint ignore=DL3008

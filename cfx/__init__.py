@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from cfx.core.command import Command as Command
     from cfx.core.component import API_VERSION as API_VERSION
     from cfx.core.component import Settings as Settings
-    from cfx.core.engine.base import Engine as Engine
+    from cfx.core.engine import Engine as Engine
     from cfx.core.parameters import Parameter as Parameter
     from cfx.core.parameters import ParameterSpace as ParameterSpace
     from cfx.core.registry import get as get
@@ -102,7 +102,7 @@ _HOMES = {
     "Simulator": "cfx.simulation.simulator",
     "SimulatorSettings": "cfx.simulation.simulator",
     "Stepper": "cfx.simulation.base",
-    "Engine": "cfx.core.engine.base",
+    "Engine": "cfx.core.engine",
     "Optimizer": "cfx.calibration.optimizers.base",
     "CandidateLosses": "cfx.calibration.optimizers.base",
     "Objective": "cfx.calibration.objectives.base",

@@ -11,12 +11,12 @@ import pandas as pd
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.data.style import CLUSTERS, StyleResult
-from cfx.evaluation.distributions import DISTRIBUTION_COLUMNS
-from cfx.evaluation.forecasts import FORECAST_COLUMNS, FORECAST_METHODS
 from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import VALUE_COLUMNS
+from cfx_forecasts.distributions import DISTRIBUTION_COLUMNS
+from cfx_forecasts.errors import FORECAST_COLUMNS, FORECAST_METHODS
 
 TWO = ParameterSpace.of(
     Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time"),

@@ -16,11 +16,12 @@ import pytest
 from hydra.core.hydra_config import HydraConfig
 
 import cfx
-from cfx.app import application, cli, ui
+from cfx.app import application, cli
 from cfx.core import registry
 from cfx.core.errors import CfxError, ConfigError, DataError
 from cfx.data.tidy import write_tidy
 from cfx.results.store import open_store
+from cfx_ui import serve
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 
@@ -453,7 +454,7 @@ def test_ui_starts_mlflow_on_this_machine_only_and_prints_links(
     monkeypatch.setattr(
         os, "execve", lambda path, command, environment: started.append((command, environment))
     )
-    monkeypatch.setattr(ui, "_links", lambda store, port: [f"links for {store}"])
+    monkeypatch.setattr(serve, "_links", lambda store, port: [f"links for {store}"])
     store = f"sqlite:///{tmp_path}/mlflow.db"
     open_store(store, "cfx")
     assert cli.main(["ui", "--uri", store, "--port", "5793"]) == 0

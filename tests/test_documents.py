@@ -195,6 +195,8 @@ def test_the_documents_commands_compose(command: str) -> None:
 @pytest.mark.parametrize("call", of_sub_commands())
 def test_the_documents_sub_commands_have_these_options(call: str) -> None:
     name, *arguments = shlex.split(call)[3:]
+    if arguments and f"{name}.{arguments[0]}" in registry.names("command"):
+        name, arguments = f"{name}.{arguments[0]}", arguments[1:]
     command = cfx.get("command", name)()
     assert isinstance(command, cfx.Command)
     command.parse(arguments)

@@ -14,9 +14,9 @@ import pytest
 
 import cfx
 from cfx.app import cli
-from cfx.report.runs import read_runs
-from cfx.report.section import formatted
-from cfx.report.sections import calibration
+from cfx_report.runs import read_runs
+from cfx_report.section import formatted
+from cfx_report.sections import calibration
 from cfx_sumo.export import export
 
 JOB = [

@@ -12,8 +12,8 @@ from filelock import FileLock, SoftFileLease, Timeout
 
 from cfx.app.sweep import only_one
 from cfx.calibration.cache import Cache
-from cfx.core import locks
-from cfx.core.locks import is_shared, lock_for
+from cfx.core import files
+from cfx.core.files import is_shared, lock_for
 
 MOUNTS = """\
 /dev/sda1 / ext4 rw 0 0
@@ -60,9 +60,9 @@ def test_there_a_lock_is_a_lease_and_elsewhere_the_systems(
 HOLD = """
 import sys, time
 from pathlib import Path
-from cfx.core import locks
-locks.LEASE_S = 2.0
-lock = locks.lock_for(Path(sys.argv[1]))
+from cfx.core import files
+files.LEASE_S = 2.0
+lock = files.lock_for(Path(sys.argv[1]))
 lock.acquire()
 print("held", flush=True)
 time.sleep(60)
@@ -73,7 +73,7 @@ def test_a_lease_is_held_while_it_is_renewed_and_free_after_its_process_is_kille
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CFX_SHARED_STORAGE", "1")
-    monkeypatch.setattr(locks, "LEASE_S", 2.0)
+    monkeypatch.setattr(files, "LEASE_S", 2.0)
     with subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path / "lock")],
         stdout=subprocess.PIPE,

@@ -70,14 +70,6 @@ def test_the_wheel_holds_the_package_and_its_config_files(tmp_path: Path) -> Non
     }
     assert conf <= names
     assert {"cfx/CITATION.cff", "cfx/app/cli.py", "cfx/py.typed", "cfx/models/krauss.py"} <= names
-    assets = ROOT / "cfx" / "report" / "assets"
-    found = {
-        f"cfx/report/assets/{path.relative_to(assets).as_posix()}"
-        for path in assets.rglob("*")
-        if path.is_file()
-    }
-    assert found
-    assert found <= names
     assert any(name.endswith("licenses/LICENSE") for name in names)
     assert not [name for name in names if name.startswith(("tests/", "conf/", "outputs/"))]
 

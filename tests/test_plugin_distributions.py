@@ -15,6 +15,7 @@ from pathlib import Path
 import pytest
 
 import cfx
+import cfx_report.section  # noqa: F401 - adds the kind of sections
 from cfx.core import registry
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -23,33 +24,67 @@ READERS = {
     "cfx.data.files",
     "cfx.data.pairs",
     "cfx.data.resample",
-    "cfx.data.series",
     "cfx.data.table",
     "cfx.data.tracks",
 }
-REPORTS = {
-    "cfx.report.figures.canvas",
-    "cfx.report.figures.figure",
-    "cfx.report.figures.text",
-    "cfx.report.job",
-    "cfx.report.runs",
-    "cfx.report.section",
-    "cfx.results.look",
+FIGURES = {
+    "cfx.figures.calibration",
+    "cfx.figures.canvas",
+    "cfx.figures.figure",
+    "cfx.figures.improvements",
+    "cfx.figures.job",
+    "cfx.figures.text",
+    "cfx.figures.trajectories",
+    "cfx.figures.write",
+}
+RESULTS = {
+    "cfx.core.console",
+    "cfx.core.files",
+    "cfx.core.progress",
+    "cfx.calibration.identifiability",
+    "cfx.core.component",
+    "cfx.core.job_folder",
+    "cfx.core.storage",
+    "cfx.data.site_styles",
+    "cfx.data.style",
+    "cfx.data.units",
+    "cfx.evaluation.comparison",
+    "cfx_forecasts.distributions",
+    "cfx.evaluation.forecasts",
+    "cfx.evaluation.headline",
+    "cfx.evaluation.result",
+    "cfx.evaluation.sites",
+    "cfx.evaluation.tables",
+    "cfx.learners.curves",
+    "cfx.results.provenance",
+    "cfx.results.store",
+    "cfx.results.tracker",
 }
 PROTOCOLS = {
     "cfx.core.memory",
     "cfx.evaluation.closed_loop",
     "cfx.evaluation.protocols.finished",
     "cfx.evaluation.protocols.held_out",
-    "cfx.evaluation.protocols.noise",
+    "cfx_forecasts.noise",
     "cfx.models.limits",
     "cfx.models.speed_limit",
+    "cfx.models.residual",
+    "cfx.policies.core",
+    "cfx.policies.heads.stochastic",
+    "cfx.simulation.base",
     "cfx.policies.features",
     "cfx.simulation.kernel.compiler",
     "cfx.simulation.rollout",
 }
-POLICIES = {"cfx.policies.checkpoint", "cfx.policies.ready", "cfx.policies.valid_range"}
-PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *REPORTS, *PROTOCOLS, *POLICIES} | {
+POLICIES = {
+    "cfx.calibration.losses",
+    "cfx.calibration.prior",
+    "cfx.policies.checkpoint",
+    "cfx.policies.ready",
+    "cfx.policies.valid_range",
+    "cfx.simulation.trajectory",
+}
+PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *FIGURES, *RESULTS, *PROTOCOLS, *POLICIES} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
 """What a plugin may import from, and `cfx.contracts`; docs/plugins.md says so."""

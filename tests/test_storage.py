@@ -20,8 +20,8 @@ from cfx.core.errors import CfxError, DataError, OutputError
 from cfx.core.extras import install_line
 from cfx.core.storage import RemoteFolder, is_url, local_copies, state
 from cfx.data.tidy import TidyDataset, write_tidy
-from cfx.report.runs import read_runs
 from cfx.results.config import JobConfig
+from cfx_report.runs import read_runs
 from tests.broken_plugins import QUICK
 from tests.drives import straight_pairs
 

@@ -9,8 +9,8 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.data.pairs import Pair
-from cfx.report.figures.canvas import Line, canvas, draw_lines, method_legend, styled
-from cfx.results.look import colour_of
+from cfx.figures.canvas import Line, canvas, draw_lines, method_legend, styled
+from cfx.figures.text import colour_of
 
 
 @styled

@@ -116,13 +116,13 @@ class Fit:
 
     def plot(self) -> Figure:
         """Draws the parameters between their bounds, and how they go together."""
-        from cfx.report.figures.calibration import (
+        from cfx.figures.calibration import (
             correlations,
             draw_calibration,
             parameter_spreads,
         )
-        from cfx.report.figures.figure import ParameterAxis
-        from cfx.report.notebook import for_notebooks
+        from cfx.figures.figure import ParameterAxis
+        from cfx.figures.write import for_notebooks
 
         tables = []
         for method in METHODS:
@@ -193,7 +193,7 @@ class Fit:
         )
 
     def _repr_html_(self) -> str:
-        from cfx.report.notebook import as_html
+        from cfx.figures.write import as_html
 
         return as_html(repr(self), self.summary())
 

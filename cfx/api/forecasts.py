@@ -61,7 +61,7 @@ class Forecast:
             pair_ids: which; None: the first three.
         """
         from cfx.api.figures import draw_fans
-        from cfx.report.notebook import for_notebooks
+        from cfx.figures.write import for_notebooks
 
         chosen = list(self.paths["pair_id"].unique()[:3]) if pair_ids is None else list(pair_ids)
         return for_notebooks(draw_fans(chosen, self.quantiles(), self.measured))
@@ -71,7 +71,7 @@ class Forecast:
         return f"Forecast({pairs} pairs, {self.paths['path'].nunique()} paths each)"
 
     def _repr_html_(self) -> str:
-        from cfx.report.notebook import as_html
+        from cfx.figures.write import as_html
 
         return as_html(repr(self), self.quantiles())
 

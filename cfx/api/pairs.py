@@ -127,7 +127,7 @@ class Pairs:
             pair_ids: which; None: the first three.
         """
         from cfx.api.figures import draw_pairs
-        from cfx.report.notebook import for_notebooks
+        from cfx.figures.write import for_notebooks
 
         chosen = self.selected[:3] if pair_ids is None else self.select(pair_ids).selected
         return for_notebooks(draw_pairs(list(chosen)))
@@ -144,7 +144,7 @@ class Pairs:
         )
 
     def _repr_html_(self) -> str:
-        from cfx.report.notebook import as_html
+        from cfx.figures.write import as_html
 
         return as_html(repr(self), self.summary)
 

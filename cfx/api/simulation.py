@@ -18,7 +18,7 @@ from cfx.core import registry
 from cfx.core.errors import ConfigError, DataError, listed, nearest
 from cfx.core.guest import visit
 from cfx.data.pairs import Pair, PairBatch, PairSet
-from cfx.data.series import accelerations, driven
+from cfx.data.tracks import accelerations, driven
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -27,8 +27,7 @@ from filelock import Timeout
 from numpy.typing import NDArray
 
 from cfx.core.errors import OutputError
-from cfx.core.files import atomic_write
-from cfx.core.locks import lock_for
+from cfx.core.files import atomic_write, lock_for
 from cfx.core.storage import RemoteFolder
 
 log = logging.getLogger(__name__)

@@ -32,8 +32,8 @@ from cfx.calibration.shards import (
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import scratch
 from cfx.core.component import content_key
-from cfx.core.engine.base import Engine
-from cfx.core.engine.local import LocalEngine
+from cfx.core.engine import Engine
+from cfx.core.local_engine import LocalEngine
 from cfx.core.parameters import ParameterSpace
 from cfx.core.progress import Task
 from cfx.data.pairs import Pair, PairBatch, PairSet

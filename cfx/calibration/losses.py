@@ -251,7 +251,7 @@ it in fetching pages."""
 
 _SUMMED_AT_ONCE = 1 << 25
 """The same where a kernel sums up losses without trajectories: what it writes is freed and written
-again, and stays in the process's own memory (`cfx.simulation.allocator`)."""
+again, and stays in the process's own memory (`cfx.core.memory`)."""
 
 _SEGMENTS_AT_ONCE = 1024
 """Segments that are simulated for a block of candidates: memory does not grow with their number,

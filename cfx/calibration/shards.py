@@ -23,7 +23,7 @@ from cfx.calibration.optimizers.base import Optimizer, Solution
 from cfx.calibration.prior import Prior, squashed
 from cfx.core import registry
 from cfx.core.component import content_key, folder_hash
-from cfx.core.engine.base import Report, Unfit
+from cfx.core.engine import Report, Unfit
 from cfx.core.errors import EngineError, PluginError
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch

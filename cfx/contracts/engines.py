@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import closing
 
 from cfx.contracts.contract import contract_of
-from cfx.core.engine.base import Engine, Report
+from cfx.core.engine import Engine, Report
 from cfx.core.errors import DataError
 
 SHARDS = 5

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from pathlib import Path
 from typing import ClassVar
 
 from cfx.core.component import Component
@@ -46,4 +47,27 @@ class Command(Component):
 
         Raises:
             CfxError: the user's mistake, in one sentence; the exit code is then 2.
+        """
+
+
+class ExportFormat(ABC):
+    """Base of every format of `cfx export`, which goes by the name of its entry point.
+
+    One is made without arguments for each call of the command.
+    """
+
+    @abstractmethod
+    def write(self, run: str, output: Path | None) -> list[str]:
+        """Writes a job's drivers for another program.
+
+        Args:
+            run: as the user names it: a job's folder, its URL, the id of its MLflow run, or
+                `cfx://NAME`.
+            output: the file; None: the format's own name for it.
+
+        Returns:
+            Sentences for the user.
+
+        Raises:
+            CfxError: the job cannot be read, or not be written in this format.
         """

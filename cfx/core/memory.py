@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ctypes
+import functools
 import sys
 
 import psutil  # type: ignore[import-untyped]  # it ships no types
@@ -60,3 +61,20 @@ def in_units(size: float) -> str:
         size /= 1000
         place += 1
     return f"{size:.3g} {_UNITS[place]}"
+
+
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # from glibc's malloc.h
+_TRIM_BYTES, _MMAP_BYTES = 64 << 20, 32 << 20
+
+
+@functools.cache
+def keep_freed_memory() -> bool:
+    """Makes glibc keep up to 64 MB of freed memory; returns whether this is glibc.
+
+    The values are the highest that glibc itself would come to; it only starts from lower ones.
+    """
+    try:
+        mallopt = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return False
+    return bool(mallopt(_M_MMAP_THRESHOLD, _MMAP_BYTES) and mallopt(_M_TRIM_THRESHOLD, _TRIM_BYTES))

@@ -100,7 +100,7 @@ KINDS: dict[str, Kind] = {
         Kind("optimizer", "cfx.calibration.optimizers.base:Optimizer", is_tried=True),
         Kind("simulator", "cfx.simulation.simulator:Simulator", is_tried=True),
         Kind("objective", "cfx.calibration.objectives.base:Objective", is_tried=True),
-        Kind("engine", "cfx.core.engine.base:Engine"),
+        Kind("engine", "cfx.core.engine:Engine"),
         Kind("learner", "cfx.learners.base:Learner"),
         Kind("protocol", "cfx.evaluation.protocols.base:Protocol"),
         Kind(
@@ -120,13 +120,15 @@ KINDS: dict[str, Kind] = {
 PARTS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
-        Kind("figure", "cfx.report.figures.figure:JobFigure", chosen=False),
-        Kind("section", "cfx.report.section:Section", chosen=False),
+        Kind("figure", "cfx.figures.figure:JobFigure", chosen=False),
         Kind("head", "cfx.policies.heads.base:ParameterHead", group="learner.head", chosen=False),
-        Kind("export", "cfx.core.export:ExportFormat", chosen=False),
+        Kind("export", "cfx.core.command:ExportFormat", chosen=False),
     )
 }
-"""Kinds of classes that come in the same way, are no components to configure, and have no suite."""
+"""Kinds of classes that come in the same way, are no components to configure, and have no suite.
+
+`add_kind` adds those of other distributions.
+"""
 
 GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
 """Kinds by config group, of which a job chooses one component each; of demo perhaps none."""
@@ -179,6 +181,17 @@ _tried: set[tuple[Entry, str]] = set()
 """Components that were tried, with their settings as JSON."""
 
 
+def add_kind(kind: Kind) -> None:
+    """Adds a kind of a distribution of its own, whose classes come in by `kind.entry_points`.
+
+    Raises:
+        PluginError: there is another kind of that name.
+    """
+    if {**KINDS, **PARTS}.get(kind.name, kind) != kind:
+        raise PluginError(f"there is a kind '{kind.name}' already; choose another name")
+    PARTS[kind.name] = kind
+
+
 def kind_of(kind: str) -> Kind:
     """Returns a kind by its name or by its config group (`dataset` or `data`).
 
@@ -201,7 +214,7 @@ def entries(kind: str) -> tuple[Entry, ...]:
     Raises:
         PluginError: there is no such kind.
     """
-    announced = _announced(_search_path())[kind_of(kind).name]
+    announced = _of_kind(kind_of(kind))
     added = [one for one in _of_this_process.values() if one.kind == kind_of(kind).name]
     if not added:
         return announced
@@ -272,7 +285,7 @@ def add(kind: str, name: str, cls: type[Component]) -> None:
             the contract of its kind.
     """
     about = kind_of(kind)
-    for other in _announced(_search_path())[about.name]:
+    for other in _of_kind(about):
         if other.name == name:
             raise PluginError(
                 f"{other} is installed, and {about.call(name)} means it; choose another name"
@@ -540,12 +553,16 @@ def _metadata_in(folder: str, changed: float) -> tuple[str, ...]:
     return tuple(found)
 
 
+def _of_kind(kind: Kind) -> tuple[Entry, ...]:
+    return _announced(_search_path()).get(kind.entry_points, ())
+
+
 @functools.lru_cache(maxsize=1)
 def _announced(
     search_path: tuple[tuple[str, ...], ...],  # noqa: ARG001 - the cache's key
 ) -> dict[str, tuple[Entry, ...]]:
-    """Returns the entries of every kind, sorted."""
-    found: dict[str, list[Entry]] = {name: [] for name in (*KINDS, *PARTS)}
+    """Returns the entries of every entry-point group of cfx, sorted."""
+    found: dict[str, list[Entry]] = {}
     seen = set()
     for distribution in importlib.metadata.distributions():
         try:
@@ -553,18 +570,18 @@ def _announced(
         except Exception:  # noqa: S112 - metadata that cannot be read announces nothing
             continue
         # The first of a name on the search path is the one that is imported.
-        if announced and announced[0].distribution not in seen:
-            seen.add(announced[0].distribution)
-            for one in announced:
-                found[one.kind].append(one)
+        if announced and announced[0][1].distribution not in seen:
+            seen.add(announced[0][1].distribution)
+            for group, one in announced:
+                found.setdefault(group, []).append(one)
     ordered = {}
-    for name, ones in found.items():
-        ordered[name] = tuple(sorted(ones, key=attrgetter("name", "distribution")))
+    for group, ones in found.items():
+        ordered[group] = tuple(sorted(ones, key=attrgetter("name", "distribution")))
     return ordered
 
 
-def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
-    """Yields what one distribution announces.
+def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[str, Entry]]:
+    """Yields what one distribution announces, each with its entry-point group.
 
     Raises:
         ValueError: its metadata are damaged.
@@ -572,7 +589,10 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
     kinds = {kind.entry_points: kind.name for kind in (*KINDS.values(), *PARTS.values())}
     points = list(distribution.entry_points)
     api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
-    ours = [point for point in points if point.group in kinds]
+    ours = []
+    for point in points:
+        if point.group.startswith("cfx.") and point.group != API_GROUP:
+            ours.append(point)
     if not ours:
         return
     metadata = distribution.metadata  # read anew each time that it is asked for
@@ -584,15 +604,18 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[Entry]:
         summary = metadata["Summary"]
     location = str(distribution.locate_file(""))
     for point in ours:
-        yield Entry(
-            kind=kinds[point.group],
-            name=point.name,
-            target=point.value,
-            distribution=name,
-            version=version,
-            location=location,
-            summary=summary,
-            api=api,
+        yield (
+            point.group,
+            Entry(
+                kind=kinds.get(point.group, point.group.removeprefix("cfx.").removesuffix("s")),
+                name=point.name,
+                target=point.value,
+                distribution=name,
+                version=version,
+                location=location,
+                summary=summary,
+                api=api,
+            ),
         )
 
 

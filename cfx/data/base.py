@@ -310,7 +310,7 @@ def joined(files: Iterable[PairSet]) -> PairSet:
 
     Of several files each is a site of its own name, unless it says otherwise. What was left out for
     the same reason is counted together. Where there are many pairs, their signals are moved into
-    temporary files (`cfx.core.scratch`), so that memory holds those of one file.
+    temporary files (`cfx.core.memory`), so that memory holds those of one file.
 
     Args:
         files: read one after the other.

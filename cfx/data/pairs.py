@@ -263,6 +263,10 @@ class PairSet(Sequence[Pair]):
             stored.append(replace(pair, **signals, truth=truth))
         return replace(self, pairs=tuple(stored))
 
+    def take(self, numbers: Sequence[int]) -> PairSet:
+        """Returns the pairs at these places; nothing is counted as left out."""
+        return replace(self, pairs=tuple(self.pairs[number] for number in numbers))
+
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:
         """Keeps the pairs marked True and counts the others under `reason`."""
         kept = []
@@ -381,6 +385,14 @@ class PairBatch:
         if self.lengths.device == torch.device(device):
             return self
         return self._changed(lambda values: values.to(device))
+
+    def until(self, last: Tensor) -> PairBatch:
+        """Returns the pairs without what comes after a frame of each, `(P,)`."""
+        import torch
+
+        frames = torch.arange(self.mask.shape[1], device=last.device)
+        mask = self.mask & (frames <= last[:, None])
+        return replace(self, lengths=last + 1, mask=mask).trimmed()
 
     def trimmed(self) -> PairBatch:
         """Returns the same pairs without the frames that none of them has."""

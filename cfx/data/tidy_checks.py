@@ -16,8 +16,8 @@ from cfx.core.errors import DataError
 from cfx.data.files import Floats, Ints
 from cfx.data.kinematics import contradiction
 from cfx.data.pairs import Pair
-from cfx.data.series import accelerations, driven
 from cfx.data.table import Table
+from cfx.data.tracks import accelerations, driven
 
 Marks = NDArray[np.bool_]
 

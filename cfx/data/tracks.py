@@ -341,3 +341,19 @@ def unique_name(name: str, seen: dict[str, int]) -> str:
     if seen[name] > 1:
         return f"{name}-run{seen[name]}"
     return name
+
+
+def driven(speed: Floats, dt: float) -> Floats:
+    """Returns the distance driven since the first frame, `(T,)`, m.
+
+    As everywhere in cfx, a vehicle moves by its new speed in each step.
+    """
+    moved = np.zeros_like(speed)
+    moved[1:] = np.cumsum(speed[1:]) * dt
+    return moved
+
+
+def accelerations(speed: Floats, dt: float) -> Floats:
+    """Returns how fast the speed changes, `(T,)`, m/s2: central differences, one-sided at ends."""
+    change: NDArray[np.float64] = np.gradient(speed, dt)
+    return change

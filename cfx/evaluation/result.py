@@ -15,9 +15,8 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.calibration.flatness import with_flat_shares
+from cfx.calibration.identifiability import with_flat_shares
 from cfx.core.parameters import Parameter
-from cfx.evaluation.forecasts import forecast_columns
 from cfx.evaluation.headline import improvement_key
 from cfx.evaluation.metrics.base import SCOPES, LeftOut, MetricInfo
 from cfx.evaluation.statistics import Improvement
@@ -34,6 +33,9 @@ _PAIRS_AT_ONCE = 1024
 
 _ROWS_AT_ONCE = 1 << 17
 """Rows of the long table that are text at once, while it is written."""
+
+FORECAST = "forecast"
+"""The scope of forecasts in the long table, and what their metrics begin with."""
 
 METHODS = ("default", "population", "fixed", "shrunk", "policy")
 """What an evaluation may compare, in the order in which it is shown.
@@ -169,7 +171,7 @@ class Evaluation:
         about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver,
             cluster, style_score, fold, method, frames (that count), and a column `parameter_NAME`
             with the mean of each tuned parameter over them; of `fixed` also `flat_NAME`, on which
-            share of its range the loss is flat (`cfx.calibration.flatness`), where that was asked.
+            share of its range the loss is flat, where that was asked.
         values: a row per pair, method, scope and metric; see `cfx.evaluation.tables`.
         measured: the metrics, in the order in which they are shown.
         improvements: statistics of the policy's improvement, by scope (`test`; `steady`, after the
@@ -210,7 +212,7 @@ class Evaluation:
         With forecasts there are also the columns `forecast_METRIC`.
         """
         table = wide_table(self.about, self.values, self.measured)
-        columns = forecast_columns(self.values, table[["pair_id", "method"]])
+        columns = _forecast_columns(self.values, table[["pair_id", "method"]])
         return pd.concat([table, columns], axis=1)
 
     @property
@@ -304,3 +306,19 @@ class Evaluation:
 def _in_order(methods: pd.Series) -> tuple[str, ...]:
     present = set(methods)
     return tuple(method for method in METHODS if method in present)
+
+
+def _forecast_columns(values: pd.DataFrame, places: pd.DataFrame) -> pd.DataFrame:
+    """Returns the columns `forecast_METRIC` of `pairs.csv`; none without forecasts.
+
+    Args:
+        values: the long table.
+        places: pair_id and method of each row.
+    """
+    index = pd.MultiIndex.from_frame(places)
+    columns = {}
+    of_forecasts = values[values["scope"] == FORECAST]
+    for metric, rows in of_forecasts.groupby("metric", sort=False, observed=True):
+        column = rows.set_index(["pair_id", "method"])["value"]
+        columns[f"{FORECAST}_{metric}"] = column.reindex(index).to_numpy()
+    return pd.DataFrame(columns, index=places.index)

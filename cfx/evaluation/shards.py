@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from cfx.core import scratch
-from cfx.core.engine.base import Engine, Report
+from cfx.core.engine import Engine, Report
 from cfx.core.memory import give_back
 from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
 from cfx.policies.agent import Agent, TrainedOn
@@ -96,7 +96,7 @@ def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
 class _Joined:
     """Closed loops of P pairs, put together from shards in any order.
 
-    Those of many pairs lie in files (`cfx.core.scratch`). Frames that a shard has not, because all
+    Those of many pairs lie in files (`cfx.core.memory`). Frames that a shard has not, because all
     its pairs end before, repeat its last one and do not count, as frames after the end of a pair.
 
     Args:

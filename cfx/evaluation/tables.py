@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.calibration.flatness import COLUMN
+from cfx.calibration.identifiability import COLUMN
 from cfx.evaluation.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
 from cfx.simulation.trajectory import TRANSIENT_S
 

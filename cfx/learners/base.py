@@ -21,9 +21,9 @@ from cfx.calibration.objectives.base import Objective
 from cfx.calibration.objectives.rmse import SpeedRmse
 from cfx.calibration.windows import Split, WindowSettings
 from cfx.core.component import Component
-from cfx.core.engine.base import Engine
-from cfx.core.engine.local import LocalEngine
+from cfx.core.engine import Engine
 from cfx.core.errors import ConfigError
+from cfx.core.local_engine import LocalEngine
 from cfx.data.pairs import PairBatch
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy, PolicyNetwork

@@ -27,10 +27,9 @@ from cfx.core.errors import DataError, PluginError
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.context import UNSEEN, ContextRule, DriverContext
+from cfx.policies.context import UNSEEN, ContextRule, DriverContext, ExpectedError
 from cfx.policies.core import AgentCore
 from cfx.policies.driver_features import measure
-from cfx.policies.expected_error import ExpectedError
 from cfx.policies.features import History, Scaler, measured_history
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.offset import blended, shrunk

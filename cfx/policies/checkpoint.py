@@ -25,9 +25,8 @@ from cfx.core.job_folder import examine, parse_json
 from cfx.models.base import DrivingModel
 from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.base import Policy
-from cfx.policies.context import ContextRule
+from cfx.policies.context import ContextRule, ExpectedError
 from cfx.policies.core import AgentCore, features_read, network_with_weights
-from cfx.policies.expected_error import ExpectedError
 from cfx.policies.features import Scaler
 from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead

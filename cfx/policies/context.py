@@ -5,9 +5,12 @@ Shapes: D drivers, n tuned parameters, k driver features.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from torch import Tensor
 
 
@@ -39,10 +42,49 @@ class ContextRule:
         shrinkage: how far these parameters are shrunk towards the model's default, 0 to 1.
         history_s: measured history that the agent observes before a test, s; None: all there is.
         combines: the driver's own calibrated parameters drive beside the agent, where they are
-            known (`cfx.evaluation.combination`).
+            known (`cfx.evaluation.protocols.past`).
     """
 
     driver_specific: bool = True
     shrinkage: float = 0.0
     history_s: float | None = None
     combines: bool = False
+
+
+LEVEL = 0.9
+"""Share of drivers for whom a bound holds."""
+
+Floats = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ExpectedError:
+    """Factors on the errors in drivers' pasts that bound 90 % of the errors to come.
+
+    Attributes:
+        policy: of the policy as it was tested, beside drivers' own parameters if it was so.
+        own: of the drivers' own parameters.
+    """
+
+    policy: float
+    own: float
+
+
+def growth_bound(growth: Floats, group: NDArray[np.int64]) -> float:
+    """Returns the factor that 90 % of drivers' errors grow by at most.
+
+    Args:
+        growth: error in the test over error in the past, `(D,)`; NaN where it is not known.
+        group: the site or fold of each, `(D,)`; each counts once.
+
+    Returns:
+        The quantile with the correction for a finite number of drivers; NaN where nine or fewer are
+        known, of whom none is a bound.
+    """
+    known = np.isfinite(growth)
+    growth, group = growth[known], group[known]
+    if math.ceil(LEVEL * (len(growth) + 1)) > len(growth):
+        return math.nan
+    _, number, size = np.unique(group, return_inverse=True, return_counts=True)
+    level = LEVEL * (1.0 + 1.0 / len(growth))
+    return float(np.quantile(growth, level, method="inverted_cdf", weights=1.0 / size[number]))

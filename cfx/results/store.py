@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 from filelock import BaseFileLock, Timeout
 
 from cfx.core.errors import TrackingError
-from cfx.core.locks import lock_for
+from cfx.core.files import lock_for
 from cfx.core.storage import is_url, local_folder
 from cfx.policies.ready import folder_of_ready_made, is_ready_made
 

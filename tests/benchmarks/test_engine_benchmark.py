@@ -17,8 +17,8 @@ from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import threads
-from cfx.core.engine.base import Engine
-from cfx.core.engine.local import LocalEngine
+from cfx.core.engine import Engine
+from cfx.core.local_engine import LocalEngine
 from cfx.data.pairs import PairBatch
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper

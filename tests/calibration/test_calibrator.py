@@ -25,7 +25,7 @@ from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import CalibrationShard, Solver
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import threads
-from cfx.core.engine.base import Engine, Report
+from cfx.core.engine import Engine, Report
 from cfx.core.errors import OutputError
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.models.base import DrivingModel

@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.calibration.residuals import measure_residuals
 from cfx.data.pairs import PairBatch
 from cfx.models.krauss import Krauss
+from cfx_forecasts.residuals import measure_residuals
 from tests.drives import wavy_pairs
 from tests.models.test_residual import Steady
 

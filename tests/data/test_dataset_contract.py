@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 
 from cfx.contracts import check_contract
-from cfx.data.ngsim import NgsimDataset
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx_recordings.ngsim import NgsimDataset
 
 
 def test_noisy_synthetic_recordings_of_another_model() -> None:

@@ -19,8 +19,8 @@ import pytest
 
 from cfx.app import cli
 from cfx.core.errors import CfxError, ConfigError, DataError, OutputError
-from cfx.data.fetch import COLUMNS, fetch_ngsim_i80
-from cfx.data.ngsim import read_ngsim
+from cfx_recordings.fetch import COLUMNS, fetch_ngsim_i80
+from cfx_recordings.ngsim import read_ngsim
 
 STARTS = {"0400": 1_113_433_200_000, "0500": 1_113_436_800_000, "0515": 1_113_437_700_000}
 Row = dict[str, str]

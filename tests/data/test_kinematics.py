@@ -15,11 +15,11 @@ from cfx.core.errors import DataError
 from cfx.data.base import Dataset
 from cfx.data.describe import describe
 from cfx.data.kinematics import check_kinematics, contradiction, contradictions, in_words
-from cfx.data.ngsim import NgsimDataset
 from cfx.data.pairs import Pair, PairSet
-from cfx.data.series import driven
 from cfx.data.tidy import TidyDataset, frame_of
+from cfx.data.tracks import driven
 from cfx.models.krauss import Krauss
+from cfx_recordings.ngsim import NgsimDataset
 from tests.conftest import ROOT
 from tests.drives import wavy_pairs
 

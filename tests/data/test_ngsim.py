@@ -14,9 +14,9 @@ from hypothesis import strategies as st
 
 from cfx.core.errors import DataError
 from cfx.data.describe import describe
-from cfx.data.ngsim import FOOT, NgsimDataset, read_ngsim
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset
+from cfx_recordings.ngsim import FOOT, NgsimDataset, read_ngsim
 
 COLUMNS = [
     *(

@@ -12,9 +12,9 @@ import pytest
 
 from cfx.core.errors import ConfigError, DataError
 from cfx.data.base import joined
-from cfx.data.ngsim import NgsimDataset
 from cfx.data.pairs import Dropped, PairSet
 from cfx.data.tidy import TidyDataset, write_tidy
+from cfx_recordings.ngsim import NgsimDataset
 from tests.data.test_ngsim import CLOCK, save, traffic
 from tests.drives import straight_pairs
 

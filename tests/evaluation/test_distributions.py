@@ -11,14 +11,14 @@ import pytest
 import torch
 from scipy import stats
 
-from cfx.evaluation.distributions import (
+from cfx.evaluation.forecasts import Origins, Paths
+from cfx_forecasts.distributions import (
     DISTRIBUTION_COLUMNS,
     Recorded,
     distribution_metrics,
     score_distributions,
     summarize_distributions,
 )
-from cfx.evaluation.forecasts import Origins, Paths
 
 DT = 0.1
 STEPS = 20

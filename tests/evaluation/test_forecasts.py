@@ -13,22 +13,19 @@ from torch import Tensor
 from cfx.data.pairs import PairBatch
 from cfx.evaluation import forecasts
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.evaluation.forecasts import (
-    LeaderFuture,
-    Origins,
+from cfx.evaluation.forecasts import LeaderFuture, Origins, measured_paths, simulate_from_origins
+from cfx.models.krauss import Krauss
+from cfx.policies.agent import Agent
+from cfx.policies.gru import GruPolicy
+from cfx.simulation.rollout import MemoryStepper
+from cfx_forecasts.errors import (
     errors_by,
     forecast_errors,
     forecast_metrics,
     forecast_values,
     kinematic_paths,
-    measured_paths,
-    simulate_from_origins,
     summarize_forecasts,
 )
-from cfx.models.krauss import Krauss
-from cfx.policies.agent import Agent
-from cfx.policies.gru import GruPolicy
-from cfx.simulation.rollout import MemoryStepper
 from tests.drives import straight_pairs, wavy_pairs
 from tests.evaluation.test_closed_loop import adaptive, constant
 

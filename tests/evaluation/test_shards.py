@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.core.engine.local import LocalEngine
+from cfx.core.local_engine import LocalEngine
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.evaluation import shards
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop

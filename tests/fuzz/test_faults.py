@@ -19,8 +19,8 @@ import cfx.app.job.output
 import cfx.calibration.cache
 import cfx.core.files
 import cfx.data.tidy
+import cfx.figures.write
 import cfx.policies.checkpoint
-import cfx.report.figures.write
 from cfx.app import cli
 from cfx.core.errors import Terminated
 from tests.broken_plugins import QUICK
@@ -34,7 +34,7 @@ MODULES = (
     cfx.data.tidy,
     cfx.core.files,
     cfx.app.job.output,
-    cfx.report.figures.write,
+    cfx.figures.write,
 )
 """Whoever writes files."""
 
@@ -87,7 +87,7 @@ def unrendered(figure: Figure, file: Path, **options: object) -> None:
 
 def job(folder: Path, faults: Faults, monkeypatch: pytest.MonkeyPatch) -> int:
     with monkeypatch.context() as patched:
-        patched.setattr(cfx.report.figures.write, "draw", undrawn)
+        patched.setattr(cfx.figures.write, "draw", undrawn)
         patched.setattr(Figure, "savefig", unrendered)
         for module in MODULES:
             patched.setattr(module, "atomic_write", faults.atomic_write)

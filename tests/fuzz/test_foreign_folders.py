@@ -21,8 +21,8 @@ from cfx.app import cli
 from cfx.core.errors import CfxError
 from cfx.evaluation.protocols.transfer import Transfer, TransferSettings
 from cfx.policies import checkpoint
-from cfx.report.page import render
-from cfx.report.runs import read_runs
+from cfx_report.page import render
+from cfx_report.runs import read_runs
 from cfx_sumo.export import export
 from cfx_sumo.live.driver import Driver
 from tests.broken_plugins import QUICK

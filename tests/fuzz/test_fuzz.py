@@ -25,11 +25,11 @@ from cfx.calibration.cache import Cache
 from cfx.core import registry
 from cfx.core.errors import CfxError
 from cfx.data.describe import describe
-from cfx.data.ngsim import NgsimDataset
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.tracker import MlflowTracker
+from cfx_recordings.ngsim import NgsimDataset
 from tests.agents import adaptive
 from tests.drives import straight_pairs
 

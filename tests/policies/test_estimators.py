@@ -27,14 +27,14 @@ from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore
-from cfx.policies.estimator import EstimatorPolicy
 from cfx.policies.features import Scaler, token_width
 from cfx.policies.heads import head_class
 from cfx.policies.heads.direct import DirectHead
-from cfx.policies.particle_filter import ParticleFilterPolicy, reweighted
-from cfx.policies.recalibrate import RecalibratePolicy
-from cfx.policies.ukf import UkfPolicy, unscented_update
 from cfx.simulation.rollout import MemoryStepper
+from cfx_estimators.estimator import EstimatorPolicy
+from cfx_estimators.particle_filter import ParticleFilterPolicy, reweighted
+from cfx_estimators.recalibrate import RecalibratePolicy
+from cfx_estimators.ukf import UkfPolicy, unscented_update
 from cfx_sumo.vtype import SumoVType
 from tests.drives import wavy_pairs
 

@@ -7,7 +7,7 @@ from contextlib import contextmanager
 
 import pytest
 
-from cfx.report.figures import write
+from cfx.figures import write
 
 
 @contextmanager

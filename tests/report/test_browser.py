@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cfx.report.page import write_report
-from cfx.report.runs import read_runs
+from cfx_report.page import write_report
+from cfx_report.runs import read_runs
 from tests.browser import Browser
 from tests.report.folders import write_job
 

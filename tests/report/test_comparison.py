@@ -8,15 +8,15 @@ from pathlib import Path
 
 import pytest
 
-from cfx.evaluation.forecasts import forecast_methods, forecast_metrics
 from cfx.evaluation.result import Purpose
-from cfx.report.job import Job
-from cfx.report.page import render, summary
-from cfx.report.runs import read_runs
-from cfx.report.section import Sheet
-from cfx.report.sections.comparison import absolute, closeness, safety
-from cfx.report.sections.forecasts import crps_sheet, errors
-from cfx.report.sections.results import safety_of_methods
+from cfx.figures.job import Job
+from cfx_forecasts.errors import forecast_methods, forecast_metrics
+from cfx_forecasts.sections import crps_sheet, errors
+from cfx_report.page import render, summary
+from cfx_report.runs import read_runs
+from cfx_report.section import Sheet
+from cfx_report.sections.comparison import absolute, closeness, safety
+from cfx_report.sections.results import safety_of_methods
 from tests.browser import Browser
 from tests.made_up import make_distributions, make_forecasts
 from tests.report.folders import ACROSS, write_job

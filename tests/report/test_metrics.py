@@ -9,11 +9,11 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from cfx.report.job import known_metrics
-from cfx.report.runs import read_runs
-from cfx.report.section import Sheet
-from cfx.report.sections.comparison import every_metric
-from cfx.report.sections.results import all_metrics
+from cfx.figures.job import known_metrics
+from cfx_report.runs import read_runs
+from cfx_report.section import Sheet
+from cfx_report.sections.comparison import every_metric
+from cfx_report.sections.results import all_metrics
 from tests.report.folders import write_job
 from tests.report.test_page import page_of
 

@@ -14,15 +14,15 @@ import pandas as pd
 import pytest
 
 from cfx.evaluation.result import Purpose
-from cfx.report.page import render, summary
-from cfx.report.runs import read_runs
-from cfx.report.sections import improvements, paper
-from cfx.report.sections.calibration import sheet, spreads_of
-from cfx.report.sections.comparison import absolute
-from cfx.report.sections.figures import chosen_pairs, pair_of
-from cfx.report.sections.improvements import cluster_series, pairs_of, per_driver
-from cfx.report.sections.results import overview
-from cfx.report.sections.run import duration
+from cfx_report.page import render, summary
+from cfx_report.runs import read_runs
+from cfx_report.sections import improvements, paper
+from cfx_report.sections.calibration import sheet, spreads_of
+from cfx_report.sections.comparison import absolute
+from cfx_report.sections.figures import chosen_pairs, pair_of
+from cfx_report.sections.improvements import cluster_series, pairs_of, per_driver
+from cfx_report.sections.results import overview
+from cfx_report.sections.run import duration
 from tests.report.conftest import blank_drawings
 from tests.report.folders import ACROSS, write_job
 

@@ -13,7 +13,7 @@ import yaml
 
 from cfx.app.cli import main
 from cfx.core.job_folder import without_folders
-from cfx.report.runs import read_runs
+from cfx_report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
 
 SEEDS = (0, 1, 2)

@@ -10,7 +10,7 @@ import pytest
 
 from cfx.app.cli import main
 from cfx.core.errors import DataError
-from cfx.report.runs import read_runs
+from cfx_report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
 
 

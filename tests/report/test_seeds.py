@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from cfx.report.job import Runs
-from cfx.report.names import rows_over_seeds
-from cfx.report.page import summary
-from cfx.report.runs import read_runs
-from cfx.report.sections.comparison import SeedsSection, over_seeds
+from cfx_report.jobs import Runs
+from cfx_report.names import rows_over_seeds
+from cfx_report.page import summary
+from cfx_report.runs import read_runs
+from cfx_report.sections.comparison import SeedsSection, over_seeds
 from tests.report.folders import ACROSS, write_job
 
 SEEDS = (0, 1, 2)

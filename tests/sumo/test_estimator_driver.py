@@ -9,7 +9,7 @@ import torch
 
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
-from cfx.policies.estimator import EstimatorPolicy
+from cfx_estimators.estimator import EstimatorPolicy
 from tests.policies.test_estimators import ESTIMATORS, agent_of
 
 pytest.importorskip("traci", reason="needs the extra sumo")

@@ -1,4 +1,4 @@
-"""`cfx data`: what recordings hold, and public ones to download."""
+"""`cfx data`: what recordings hold."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class DataCommand(Command):
     """Looks at recordings."""
 
-    summary = "what a recording holds (describe), a public one to download (fetch)"
+    summary = "what a recording holds (describe)"
 
     def parser(self) -> argparse.ArgumentParser:
         parser = argparse.ArgumentParser("cfx data", description="Looks at recordings.")
@@ -41,30 +41,9 @@ class DataCommand(Command):
             metavar="FILE",
             help="draw the driving styles of the sites into a file (.png, .svg, .pdf)",
         )
-        fetch = actions.add_parser(
-            "fetch",
-            help="download a public recording; nothing else in cfx uses the network unasked",
-        )
-        fetch.add_argument(
-            "recording", choices=["ngsim-i80"], metavar="ngsim-i80", help="which recording"
-        )
-        fetch.add_argument(
-            "--recording",
-            dest="part",
-            default="0400",
-            help="0400 (default), 0500, 0515 (pm, 15 minutes each) or all",
-        )
-        fetch.add_argument("--folder", default="data", help="where the file goes; default: data")
-        fetch.add_argument("--url", help="of a mirror that speaks SODA, ending in .csv")
-        fetch.add_argument(
-            "--force", action="store_true", help="download again and replace the file"
-        )
         return parser
 
     def run(self, options: argparse.Namespace) -> int:
-        if options.action == "fetch":
-            _fetch(options)
-            return 0
         _describe(options)
         return 0
 
@@ -128,7 +107,7 @@ def _draw(style: StyleResult, path: Path) -> None:
     """
     from cfx.core.files import atomic_write
     from cfx.data.site_styles import style_distances
-    from cfx.report.figures.site_styles import draw_site_styles
+    from cfx.figures.site_styles import draw_site_styles
 
     if path.suffix not in _FIGURES:
         raise ConfigError(f"--figure {path}: its name must end in {', '.join(_FIGURES)}")
@@ -164,19 +143,3 @@ def _settings(overrides: Sequence[str]) -> dict[str, Any]:
         if is_user_error(error) and not isinstance(error, CfxError):
             raise ConfigError(explain(error, overrides)) from None
         raise
-
-
-def _fetch(options: argparse.Namespace) -> None:
-    from cfx.core.console import console_logging
-    from cfx.core.files import path_override
-    from cfx.data.fetch import URL, fetch_ngsim_i80
-
-    with console_logging():
-        path = fetch_ngsim_i80(
-            Path(options.folder).expanduser(),
-            options.part,
-            url=options.url or URL,
-            force=options.force,
-        )
-    print(f"Look at it: python -m cfx data describe {shlex.quote(str(path))}")
-    print(f"Use it: python -m cfx data=ngsim {shlex.quote(path_override('data.path', path))}")

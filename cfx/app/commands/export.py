@@ -8,8 +8,7 @@ from typing import cast
 
 from cfx.app.completion import complete_with
 from cfx.core import registry
-from cfx.core.command import Command
-from cfx.core.export import ExportFormat
+from cfx.core.command import Command, ExportFormat
 
 
 class ExportCommand(Command):

@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cfx.calibration.flatness import NEAR, flat_for
+from cfx.calibration.identifiability import NEAR, flat_for
 from cfx.core.errors import without_passwords
 from cfx.evaluation.demo import PAGE
 from cfx.evaluation.headline import headline
@@ -21,7 +21,7 @@ from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import scope_label
-from cfx.report.figures.text import few_drivers, short_label
+from cfx.figures.text import few_drivers, short_label
 from cfx.results.config import JobConfig
 from cfx.results.table import Findings, Kept
 from cfx.simulation.trajectory import TRANSIENT_S

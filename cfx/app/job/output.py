@@ -157,8 +157,8 @@ def _write_figures(
     tables: list[WrittenTable],
     metrics: Mapping[str, float],
 ) -> list[Path]:
-    from cfx.report.figures.figure import Results
-    from cfx.report.figures.write import write_figures
+    from cfx.figures.figure import Results
+    from cfx.figures.write import write_figures
 
     rows = {table.about.name: table.rows for table in tables if table.rows is not None}
     results = Results.of(findings.evaluation, style=findings.style, tables=rows, metrics=metrics)

@@ -19,10 +19,10 @@ from cfx.data.style import StyleResult
 from cfx.evaluation.headline import headline, improvement_key
 from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.statistics import STATISTICS
+from cfx.figures.write import as_html
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.ready import is_ready_made
-from cfx.report.notebook import as_html
 from cfx.results.config import JobConfig
 from cfx.results.store import folder_of
 from cfx.results.table import Findings, read_tables
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from cfx.app.job.steps import Parts
-    from cfx.report.figures.figure import Results
+    from cfx.figures.figure import Results
 
 
 @dataclass(frozen=True)
@@ -139,8 +139,8 @@ class JobResult:
         Raises:
             DataError: there is no such figure, or the job has nothing of what it shows.
         """
-        from cfx.report.figures.figure import draw
-        from cfx.report.notebook import for_notebooks
+        from cfx.figures.figure import draw
+        from cfx.figures.write import for_notebooks
 
         known = {one.name: one for one in registry.installed("figure")}
         if name not in known:
@@ -155,9 +155,8 @@ class JobResult:
     @cached_property
     def _results(self) -> Results:
         """What figures are drawn from."""
-        from cfx.report.figures.figure import Results
-        from cfx.report.job import Origin
-        from cfx.report.runs import read_job
+        from cfx.figures.figure import Results
+        from cfx.figures.job import Origin, read_job
 
         if self.computed is None:
             assert self.folder is not None

@@ -23,7 +23,7 @@ from cfx.calibration.settings import CalibrationSettings, WindowSettings
 from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Split
 from cfx.core import registry
-from cfx.core.engine.base import Engine
+from cfx.core.engine import Engine
 from cfx.core.errors import ConfigError, PluginError
 from cfx.core.memory import require_memory
 from cfx.core.storage import is_url

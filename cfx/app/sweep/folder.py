@@ -24,7 +24,7 @@ from omegaconf import DictConfig, OmegaConf
 from cfx.app.sweep.record import Record
 from cfx.core.component import content_key
 from cfx.core.errors import CfxError, ConfigError
-from cfx.core.locks import lock_for
+from cfx.core.files import lock_for
 from cfx.core.storage import is_url, state
 
 log = logging.getLogger(__name__)

@@ -14,7 +14,7 @@ from cfx.core.console import blank_table
 from cfx.core.errors import DataError
 from cfx.core.files import atomic_write
 from cfx.evaluation.headline import main_comparison, ratio_of_means
-from cfx.report.figures.text import short_label
+from cfx.figures.text import short_label
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -38,7 +38,7 @@ _AFTER_OVERRIDES = (_OVER, "rmse_speed_default")
 def metric_columns(folders: Sequence[Path]) -> list[MetricInfo]:
     """Returns the metrics that any of these jobs has measured, besides the RMSE of speed."""
     from cfx.core.job_folder import optional, read_json, read_metrics
-    from cfx.report.job import known_metrics
+    from cfx.figures.job import known_metrics
 
     found: dict[str, MetricInfo] = {}
     for folder in folders:

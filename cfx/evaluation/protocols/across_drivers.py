@@ -287,9 +287,7 @@ class AcrossDrivers(Protocol):
         network = fold[tested]
         return HeldOut(
             context=context,
-            pairs=replace(
-                context.pairs, pairs=tuple(context.pairs[number] for number in tested.tolist())
-            ),
+            pairs=context.pairs.take(tested.tolist()),
             batch=context.batch[here],
             network=network.to(here.device),
             first=split.frame[tested].to(here.device),

@@ -19,7 +19,7 @@ from cfx.calibration.objectives.base import Objective
 from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.engine.base import Engine
+from cfx.core.engine import Engine
 from cfx.core.errors import DataError, PluginError
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import LearnedFrom, PairBatch, PairSet
@@ -27,15 +27,12 @@ from cfx.data.style import StyleResult
 from cfx.evaluation.metrics.base import MetricSet
 from cfx.evaluation.result import Evaluation
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
-from cfx.models.residual import TIME
 from cfx.policies.agent import Agent, TrainedOn
-from cfx.policies.base import ConstantNetwork, Policy
-from cfx.policies.core import AgentCore, features_read
+from cfx.policies.base import Policy
+from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler, token_width
-from cfx.policies.fixed import FixedPolicy
 from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.heads.stochastic import SCALE, StochasticHead
 from cfx.policies.valid_range import recorded_quantiles
 from cfx.simulation.base import Stepper
 
@@ -168,37 +165,6 @@ class ProtocolContext:
         """
         names = tuple(str(number) for number in range(len(parameters)))
         return self.ready(policy, self.untrained(policy, parameters), names)
-
-    def constant_with_noise(self, parameters: Tensor, time: Tensor, scale: Tensor) -> Agent:
-        """Returns an agent with constant parameters and auto-regressive noise on the acceleration.
-
-        Args:
-            parameters: `(N, n)`, SI units; one network for each row.
-            time: time constant with which the noise forgets, `(N,)`, s.
-            scale: standard deviation of the noise, `(N,)`, m/s2.
-
-        Raises:
-            ConfigError: the model has equations in a simulator only.
-        """
-        model, device = self.simulator.model, parameters.device
-        head = StochasticHead.for_model(model, device).of_acceleration()
-        complete = head.completed(parameters).clone()
-        for parameter, values in ((TIME, time), (SCALE, scale)):
-            column = head.space.names.index(parameter.name)
-            complete[:, column] = values.clamp(parameter.low, parameter.high)
-        policy = FixedPolicy()
-        width = features_read(policy, head, self.windows.length)
-        blank = complete.new_zeros((len(complete), width))
-        network = ConstantNetwork(head.untrained_answer(complete))
-        return Agent(
-            core=AgentCore(policy, network, Scaler(blank, blank + 1.0), head),
-            model_node=self.model_node,
-            policy_node={"name": "fixed"},
-            windows=self.windows,
-            dt=self.simulator.dt,
-            names=tuple(str(number) for number in range(len(complete))),
-            base=complete,
-        )
 
     def untrained(self, policy: Policy, parameters: Tensor) -> TrainingResult:
         """Returns a policy's networks as built; see `constant`.

@@ -214,6 +214,6 @@ class FoldsOrFinished(AcrossDrivers):
         if len(long) == len(context.pairs):
             return context
         log.info("%d pairs are too short to be tested", len(context.pairs) - len(long))
-        pairs = replace(context.pairs, pairs=tuple(context.pairs[number] for number in long))
+        pairs = context.pairs.take(long)
         rows = torch.tensor(long, device=context.batch.lengths.device)
         return replace(context, pairs=pairs, batch=context.batch[rows])

@@ -15,9 +15,8 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.closed_loop import ClosedLoop, Followers
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes
 from cfx.evaluation.evaluate import ComparedPairs, closed_loop_errors, evaluate
-from cfx.evaluation.outside import outside_of_scopes
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.protocols.past import (

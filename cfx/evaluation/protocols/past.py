@@ -20,7 +20,7 @@ Shapes: D drivers, K + 1 frames, n tuned parameters.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
@@ -34,7 +34,7 @@ from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.result import Array
 from cfx.evaluation.shards import simulate_in_shards
 from cfx.policies.agent import Agent
-from cfx.policies.expected_error import ExpectedError, growth_bound
+from cfx.policies.context import ExpectedError, growth_bound
 from cfx.policies.fixed import FixedPolicy
 
 EARLIER = 0.6
@@ -114,24 +114,25 @@ def past_errors(
     if bool(known.any()):
         rows = known.nonzero()[:, 0]
         numbers = rows.tolist()
-        pairs = replace(pairs, pairs=tuple(pairs[number] for number in numbers))
+        pairs = pairs.take(numbers)
         first, cut, network, base = first[rows], cut[rows], network[rows], base[rows]
-        batch = _until(batch[rows], first)
+        batch = batch[rows].until(first)
         early = context.calibrator.fixed(pairs, batch, cut.cpu()).to(base)
         if policy.base is not None and policy.context_rule.driver_specific:
             base = policy.base_of(early)[:, : early.shape[1]]
         each = torch.arange(len(rows), device=rows.device)
         residual = policy.head.driven_model(context.simulator.model) is not context.simulator.model
-        agents = (
-            (context.constant(FixedPolicy(residual=residual), early), Followers(batch, each)),
-            (policy, Followers(batch, network, base)),
-            (context.constant(FixedPolicy(), early), Followers(batch, each)),
-        )
-        errors = []
-        for agent, followers in agents:
+
+        def errors(agent: Agent, followers: Followers) -> Tensor:
             loop = simulate_in_shards(context.engine, context.simulator, agent, followers, cut)
-            errors.append(_speed_errors(loop, batch, cut))
-        own, of_policy, of_fixed = errors
+            return _speed_errors(loop, batch, cut)
+
+        of_policy = errors(policy, Followers(batch, network, base))
+        of_fixed = errors(context.constant(FixedPolicy(), early), Followers(batch, each))
+        own = of_fixed
+        if residual:
+            start = context.constant(FixedPolicy(residual=True), early)
+            own = errors(start, Followers(batch, each))
         frames = (first - cut).to(own)
         products = (own * own, of_policy * of_policy, own * of_policy, of_fixed * of_fixed)
         for row, product in zip(found, products, strict=True):
@@ -183,9 +184,3 @@ def _speed_errors(loop: ClosedLoop, batch: PairBatch, first: Tensor) -> Tensor:
     frames = first[:, None] + torch.arange(loop.speed.shape[1], device=first.device)
     measured = batch.follower_speed.gather(1, frames.clamp(max=batch.mask.shape[1] - 1))
     return torch.where(loop.counted, loop.speed - measured, 0.0).double()
-
-
-def _until(batch: PairBatch, last: Tensor) -> PairBatch:
-    """Returns pairs without what comes after a frame of each, `(D,)`."""
-    frames = torch.arange(batch.mask.shape[1], device=last.device)
-    return replace(batch, lengths=last + 1, mask=batch.mask & (frames <= last[:, None])).trimmed()

@@ -12,9 +12,8 @@ from torch import Tensor
 
 from cfx.calibration.windows import Split
 from cfx.core.component import Settings
-from cfx.evaluation.closed_loop import ClosedLoop, Followers
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes
 from cfx.evaluation.evaluate import ComparedPairs, evaluate
-from cfx.evaluation.outside import outside_of_scopes
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Platoon

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cfx.core.component import Settings
-from cfx.core.engine.base import Engine
+from cfx.core.engine import Engine
 from cfx.core.progress import Task
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.curves import warn_of_nothing_learned

@@ -21,6 +21,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.core.memory import keep_freed_memory
 from cfx.learners.rollout.dataset import Conditioning
 from cfx.learners.rollout.inputs import RolloutInputs
 from cfx.learners.rollout.window import (
@@ -33,7 +34,6 @@ from cfx.learners.rollout.window import (
 )
 from cfx.policies.features import token_width
 from cfx.policies.recurrent import RecurrentLayer, RecurrentNetwork
-from cfx.simulation import allocator
 from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.kernel.elementwise import Elementwise
 
@@ -118,7 +118,7 @@ class Scan:
     def __init__(
         self, step: WindowStep, temperature: Tensor | None, key: object, *, trains: bool
     ) -> None:
-        allocator.keep_freed_memory()
+        keep_freed_memory()
         network, core = step.core.network, step.core
         if not isinstance(network, RecurrentNetwork) or network.dropout.p > 0:
             raise Unsupported("networks that are not recurrent, or have dropout")

@@ -21,7 +21,7 @@ import torch
 from torch import Tensor
 
 from cfx.core.component import content_key, folder_hash
-from cfx.core.engine.local import LocalEngine
+from cfx.core.local_engine import LocalEngine
 from cfx.learners import base
 from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.learners.rollout.dataset import RolloutDataset

@@ -12,7 +12,7 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-from cfx.core.engine.base import Report
+from cfx.core.engine import Report
 from cfx.learners.batched import fit
 from cfx.learners.rollout.loop import Expert
 from cfx.learners.rollout.module import RolloutModule, StepNumbers

@@ -14,9 +14,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.core.memory import keep_freed_memory
 from cfx.core.threads import share
 from cfx.models.base import DrivingModel
-from cfx.simulation import allocator
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.kernel.graph import record
@@ -75,7 +75,7 @@ def accumulate(
     kernel = _kernel(model, dt, p, terms, key, summed=every is None)
     if kernel is None:
         return None
-    allocator.keep_freed_memory()
+    keep_freed_memory()
     shape = common_shape([(len(segments.speed), 1), *[value.shape for value in p.values()]])
     memory = model.initial_memory(segments.speed).contiguous()
     if every is None:

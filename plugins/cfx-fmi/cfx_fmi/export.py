@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pythonfmu3 import FmuBuilder
 
-from cfx.core.export import ExportFormat
+from cfx.core.command import ExportFormat
 from cfx.core.files import write_output
 from cfx.results.store import folder_of
 from cfx_onnx.export import OnnxExport

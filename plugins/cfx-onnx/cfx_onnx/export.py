@@ -10,8 +10,8 @@ from pathlib import Path
 
 import torch
 
+from cfx.core.command import ExportFormat
 from cfx.core.errors import ConfigError, DataError
-from cfx.core.export import ExportFormat
 from cfx.core.files import write_output
 from cfx.policies.agent import Agent
 from cfx.policies.checkpoint import load

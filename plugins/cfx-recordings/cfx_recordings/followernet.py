@@ -19,7 +19,7 @@ from cfx import PairSet, Settings
 from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, magic, stem
-from cfx.data.series import Series, pairs_of
+from cfx_recordings.series import Series, pairs_of
 
 _NPY, _ZIP, _MATLAB, _HDF = b"\x93NUM", b"PK\x03\x04", b"MATL", b"\x89HDF"
 
@@ -65,7 +65,7 @@ class FollowernetDataset(Dataset):
     convert a file that you trust.
 
     **Positions.** The leader's is the distance that its speed gives, the follower's is that less
-    the gap; accelerations are central differences of speeds (`cfx.data.series`).
+    the gap; accelerations are central differences of speeds (`cfx_recordings.series`).
 
     **Drivers.** The events carry no ids. Each counts as a driver of its own, so drivers cannot be
     kept apart: in an evaluation on unseen drivers the same driver may be learned from and tested.

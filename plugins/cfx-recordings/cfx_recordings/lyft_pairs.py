@@ -19,7 +19,7 @@ from cfx import PairSet, Settings
 from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
-from cfx.data.series import Series, frames_at, pairs_of
+from cfx_recordings.series import Series, frames_at, pairs_of
 
 DT = 0.1
 """Seconds between two samples."""

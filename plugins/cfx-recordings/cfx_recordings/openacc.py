@@ -17,8 +17,8 @@ from cfx import PairSet, Settings
 from cfx.core.errors import DataError, listed
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, beginning, stem
-from cfx.data.series import Series, frames_at, pairs_of
 from cfx.data.table import Column, Labels, Layout, Table, read_table
+from cfx_recordings.series import Series, frames_at, pairs_of
 
 _Column = TypeVar("_Column", Floats, Labels)
 
@@ -58,9 +58,9 @@ class OpenaccDataset(Dataset):
 
     **Positions.** Cars are located by satellite on roads that bend, so positions are made of what
     was measured along the road: the leader's is the distance that its speed gives, the follower's
-    is that less the gap (`cfx.data.series`). Lengths are not recorded, and are 0: positions of
-    leaders are those of rear bumpers. Accelerations are central differences of the speeds, which
-    most campaigns left unfiltered.
+    is that less the gap (`series.py`). Lengths are not recorded, and are 0: positions of leaders
+    are those of rear bumpers. Accelerations are central differences of the speeds, which most
+    campaigns left unfiltered.
 
     **Labels.** `driver_type` is human or acc, from the follower's `Driver` column, or, where a file
     has none, from its line `ACC` (0 or 1). A pair is cut where the driver hands over.

@@ -18,9 +18,9 @@ from cfx import PairSet, Settings
 from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
-from cfx.data.series import Series, frames_at, pairs_of
 from cfx.data.table import Column, Layout, Table, read_table
 from cfx.data.tracks import changes
+from cfx_recordings.series import Series, frames_at, pairs_of
 
 DT = 0.1
 """Seconds between two rows of a vehicle."""

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from cfx import DrivingModel
-from cfx.calibration.flatness import COLUMN
+from cfx.calibration.identifiability import COLUMN
+from cfx.core.command import ExportFormat
 from cfx.core.errors import ConfigError, DataError, listed
-from cfx.core.export import ExportFormat
 from cfx.core.files import write_output
 from cfx.core.job_folder import examine, parse_json, parse_yaml
 from cfx.core.registry import create

@@ -11,7 +11,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.evaluation.metrics.base import RECORDED
-from cfx.report.figures.canvas import (
+from cfx.figures.canvas import (
     Array,
     Line,
     canvas,
@@ -20,9 +20,8 @@ from cfx.report.figures.canvas import (
     method_legend,
     styled,
 )
-from cfx.report.figures.figure import JobFigure, Results
-from cfx.report.figures.text import label
-from cfx.results.look import BAND, EDGE
+from cfx.figures.figure import JobFigure, Results
+from cfx.figures.text import BAND, EDGE, label
 from cfx_traffic.summary import binned, mean_growth, ring_means, traffic_methods
 
 DENSITY_TITLE = "density (vehicles/km)"

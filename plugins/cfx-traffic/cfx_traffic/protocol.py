@@ -19,12 +19,12 @@ from cfx.evaluation.closed_loop import Followers, burnt_in
 from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.evaluation.protocols.held_out import HeldOut
-from cfx.evaluation.protocols.noise import can_drive, residual_noise
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.features import measured_history
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.placement import ALL
 from cfx.simulation.rollout import MemoryStepper
+from cfx_forecasts.noise import can_drive, constant_with_noise, residual_noise
 from cfx_traffic.measure import UPSTREAM_M, Measured, traffic_of
 from cfx_traffic.roads import (
     Bottleneck,
@@ -330,7 +330,7 @@ def _constant_kinds(
     else:
         ones = torch.ones_like(parameters[:, 0])
         time, scale = noise[0] * ones, noise[1] * ones
-    noisy = context.constant_with_noise(parameters, time, scale)
+    noisy = constant_with_noise(context, parameters, time, scale)
     if can_drive(MemoryStepper(context.simulator.model, noisy.dt), noisy):
         kinds[f"{name}_ar"] = _Kind(noisy, noisy.begin(each), draws=True)
     return kinds

@@ -10,8 +10,9 @@ from typing import Any
 import pandas as pd
 
 from cfx.evaluation.metrics.base import RECORDED, key_of
-from cfx.report.job import Job, Runs
-from cfx.report.section import Cell, Column, Section, Sheet, method_cell, methods_explained, number
+from cfx.figures.job import Job
+from cfx_report.jobs import Runs
+from cfx_report.section import Cell, Column, Section, Sheet, method_cell, methods_explained, number
 from cfx_traffic.summary import traffic_methods
 
 _COLUMNS = (

@@ -10,9 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.report.figures.figure import Results, draw, figure_named
-from cfx.report.figures.text import MINUS, label
-from cfx.report.runs import read_runs
+from cfx.figures.figure import Results, draw, figure_named
+from cfx.figures.text import MINUS, label
+from cfx_report.runs import read_runs
 from cfx_traffic.figures import draw_paths, draw_traffic, path_panels, traffic_panels
 from cfx_traffic.section import traffic_sheet
 from cfx_traffic.summary import traffic_methods, traffic_metrics

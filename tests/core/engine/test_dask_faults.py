@@ -17,9 +17,9 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.calibration.windows import Windows, WindowSettings
-from cfx.core.engine.base import Engine
-from cfx.core.engine.local import LocalEngine
+from cfx.core.engine import Engine
 from cfx.core.errors import EngineError
+from cfx.core.local_engine import LocalEngine
 from cfx.core.progress import Task
 from cfx.data.pairs import PairBatch
 from cfx.models.w99 import W99

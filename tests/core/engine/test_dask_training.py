@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from cfx.core import threads
-from cfx.core.engine.base import Engine
-from cfx.core.engine.local import LocalEngine
+from cfx.core.engine import Engine
+from cfx.core.local_engine import LocalEngine
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner, shard
 from cfx_dask.engine.engine import DaskEngine

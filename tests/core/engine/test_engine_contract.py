@@ -9,7 +9,7 @@ import pytest
 import cfx
 from cfx.contracts import check_contract
 from cfx.core import registry, threads
-from cfx.core.engine.local import LocalEngine
+from cfx.core.local_engine import LocalEngine
 from cfx_dask.engine.engine import DaskEngine
 from tests.core.engine.clusters import running_cluster
 

@@ -15,7 +15,7 @@ from tests.scripts import ENVIRONMENT, command_of, run_script
 
 _SCRIPT = """
 import os, sys, time
-from cfx.core.engine.processes import in_processes
+from cfx.core.local_engine import in_processes
 
 def work(shard, report):
     open(f"{shard}.{os.getpid()}", "w").close()
@@ -65,7 +65,7 @@ def test_workers_end_with_the_job(how: signal.Signals, tmp_path: Path) -> None:
 
 _SHARED = """
 import os, time
-from cfx.core.engine.processes import in_processes
+from cfx.core.local_engine import in_processes
 
 def work(shard, report):
     for _ in range(40):

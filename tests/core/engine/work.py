@@ -6,7 +6,7 @@ import os
 import time
 from pathlib import Path
 
-from cfx.core.engine.base import Report, Unfit
+from cfx.core.engine import Report, Unfit
 
 
 def slowly(shard: tuple[int, float], report: Report) -> int:

@@ -17,9 +17,9 @@ from cfx.core.errors import CfxError, DataError
 from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.forecasts import Origins, simulate_from_origins
-from cfx.evaluation.protocols.forecast import Forecast
 from cfx.policies import checkpoint
 from cfx.simulation.rollout import MemoryStepper
+from cfx_forecasts.protocol import Forecast
 from tests.evaluation.protocols.test_transfer import HERE, ROLLOUT, elsewhere, trained
 
 FORECAST = [

@@ -15,10 +15,10 @@ from rich.console import Console
 import cfx
 from cfx.core.errors import CfxError
 from cfx.data.pairs import PairSet
-from cfx.evaluation.forecasts import FORECAST_METHODS
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.results.table import Findings
-from cfx.results.tables import ForecastErrors
+from cfx_forecasts.errors import FORECAST_METHODS
+from cfx_forecasts.tables import ForecastErrors
 from tests.evaluation.protocols.test_across_drivers import QUICK
 
 FORECAST = [

@@ -20,7 +20,7 @@ from cfx.data.tidy import TidyDataset
 from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
 from cfx.evaluation.result import Array
 from cfx.policies.checkpoint import load
-from cfx.policies.expected_error import growth_bound
+from cfx.policies.context import growth_bound
 from cfx.policies.ready import folder_of_ready_made
 from cfx.results.table import Findings
 from cfx.results.tables import Past

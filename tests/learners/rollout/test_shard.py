@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from cfx.core import threads
-from cfx.core.engine.base import Engine, Report
+from cfx.core.engine import Engine, Report
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner, shard
 from cfx.learners.rollout import train as training

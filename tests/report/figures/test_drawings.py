@@ -16,16 +16,15 @@ from matplotlib.image import imread
 from cfx.core.errors import ConfigError, OutputError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.result import Evaluation, Purpose
+from cfx.figures.figure import Results, draw, figure_named
+from cfx.figures.improvements import amounts_of
+from cfx.figures.text import COLOURS, percent, pretty_unit, short, unit_label
+from cfx.figures.trajectories import drives
+from cfx.figures.write import write_figure, write_figures
 from cfx.learners.curves import over_networks
-from cfx.report.figures.figure import Results, draw, figure_named
-from cfx.report.figures.forecasts import errors_over_time
-from cfx.report.figures.improvements import amounts_of
-from cfx.report.figures.learning import SAMPLED
-from cfx.report.figures.platoon import braking_time, worst_platoon
-from cfx.report.figures.text import percent, pretty_unit, short, unit_label
-from cfx.report.figures.trajectories import drives
-from cfx.report.figures.write import write_figure, write_figures
-from cfx.results.look import COLOURS
+from cfx_forecasts.figures import errors_over_time
+from cfx_report.figures.learning import SAMPLED
+from cfx_report.figures.platoon import braking_time, worst_platoon
 from tests.made_up import GAINS, MadeUp, make_history, make_platoon, make_results
 
 TEN = ParameterSpace.of(

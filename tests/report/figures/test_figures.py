@@ -12,11 +12,11 @@ import pytest
 from matplotlib import pyplot as plt
 
 from cfx.core import registry
-from cfx.report.figures.canvas import canvas, hover
-from cfx.report.figures.figure import JobFigure, Results, draw
-from cfx.report.figures.write import PLACE, inline_svg, write_figure, write_figures
-from cfx.report.page import render
-from cfx.report.runs import read_runs
+from cfx.figures.canvas import canvas, hover
+from cfx.figures.figure import JobFigure, Results, draw
+from cfx.figures.write import PLACE, inline_svg, write_figure, write_figures
+from cfx_report.page import render
+from cfx_report.runs import read_runs
 from tests.conftest import Installer
 from tests.made_up import (
     GAINS,
@@ -64,7 +64,11 @@ def everything() -> Results:
     return dataclasses.replace(results, tables={**results.tables, **tables})
 
 
-OWN = [one for one in registry.installed("figure") if one.distribution == registry.OWN]
+OWN = [
+    one
+    for one in registry.installed("figure")
+    if one.distribution in {registry.OWN, "cfx-report", "cfx-forecasts"}
+]
 
 
 @pytest.mark.parametrize("one", OWN, ids=lambda one: one.name)
@@ -116,8 +120,8 @@ def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_sh
 
 
 FURTHER = """
-    from cfx.report.figures.canvas import canvas
-    from cfx.report.figures.figure import JobFigure
+    from cfx.figures.canvas import canvas
+    from cfx.figures.figure import JobFigure
 
     class Further(JobFigure):
         \"\"\"A figure of a third party.\"\"\"

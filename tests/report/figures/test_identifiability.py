@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.report.figures.calibration import (
+from cfx.figures.calibration import (
     draw_fits,
     draw_labels,
     draw_slices,
@@ -16,10 +16,10 @@ from cfx.report.figures.calibration import (
     labels_of,
     slice_panels,
 )
-from cfx.report.figures.figure import ParameterAxis
-from cfx.report.page import render
-from cfx.report.runs import read_runs
-from cfx.report.sections import calibration
+from cfx.figures.figure import ParameterAxis
+from cfx_report.page import render
+from cfx_report.runs import read_runs
+from cfx_report.sections import calibration
 from tests.report.folders import write_job
 
 AXES = (ParameterAxis("T", "s", 0.0, 4.0), ParameterAxis("s0", "m", 0.5, 8.0))

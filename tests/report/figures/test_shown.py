@@ -10,25 +10,12 @@ import numpy as np
 import pytest
 from matplotlib.axes import Axes
 
-from cfx.evaluation.distributions import centre_errors, summarize_distributions
-from cfx.evaluation.forecasts import errors_by_history, forecast_methods, summarize_forecasts
 from cfx.evaluation.result import Evaluation
-from cfx.learners.curves import over_networks
-from cfx.report.figures.calibration import correlations, draw_calibration, parameter_spreads
-from cfx.report.figures.figure import Results, parameter_axes
-from cfx.report.figures.forecasts import (
-    draw_by_history,
-    draw_by_horizon,
-    draw_distributions,
-    draw_errors,
-    errors_over_time,
-    pit_density,
-)
-from cfx.report.figures.improvements import draw_improvements, improvement_bars
-from cfx.report.figures.jobs import draw_every_pair
-from cfx.report.figures.learning import draw_learning, loss_quartiles
-from cfx.report.figures.platoon import braking_time, draw_platoons, worst_platoon
-from cfx.report.figures.trajectories import (
+from cfx.figures.calibration import correlations, draw_calibration, parameter_spreads
+from cfx.figures.figure import Results, parameter_axes
+from cfx.figures.improvements import draw_improvements, improvement_bars
+from cfx.figures.text import colour_of
+from cfx.figures.trajectories import (
     PairPanels,
     draw_pair,
     draw_pairs,
@@ -37,9 +24,22 @@ from cfx.report.figures.trajectories import (
     pair_panels,
     rank_pairs,
 )
-from cfx.report.runs import read_runs
-from cfx.report.sections.figures import chosen_pairs
-from cfx.results.look import colour_of
+from cfx.learners.curves import over_networks
+from cfx_forecasts.distributions import centre_errors, summarize_distributions
+from cfx_forecasts.errors import errors_by_history, forecast_methods, summarize_forecasts
+from cfx_forecasts.figures import (
+    draw_by_history,
+    draw_by_horizon,
+    draw_distributions,
+    draw_errors,
+    errors_over_time,
+    pit_density,
+)
+from cfx_report.figures.jobs import draw_every_pair
+from cfx_report.figures.learning import draw_learning, loss_quartiles
+from cfx_report.figures.platoon import braking_time, draw_platoons, worst_platoon
+from cfx_report.runs import read_runs
+from cfx_report.sections.figures import chosen_pairs
 from tests.made_up import (
     make_distributions,
     make_forecasts,

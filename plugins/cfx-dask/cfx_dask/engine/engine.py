@@ -10,7 +10,7 @@ from contextlib import closing
 from typing import Any, ClassVar
 
 from cfx import Settings
-from cfx.core.engine.base import Engine, Report, ResultT, ShardT, Work
+from cfx.core.engine import Engine, Report, ResultT, ShardT, Work
 from cfx_dask.engine.clusters import require_installed
 from cfx_dask.engine.connection import Connection
 from cfx_dask.engine.run import Run

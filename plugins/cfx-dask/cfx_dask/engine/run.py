@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Generic
 
-from cfx.core.engine.base import Report, ResultT, ShardT, Work
+from cfx.core.engine import Report, ResultT, ShardT, Work
 from cfx.core.errors import EngineError
 from cfx_dask.engine.code import installed_code
 from cfx_dask.engine.connection import Connection

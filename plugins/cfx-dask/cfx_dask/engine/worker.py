@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from cfx.core.engine.base import ResultT, ShardT, Unfit, Work
+from cfx.core.engine import ResultT, ShardT, Unfit, Work
 from cfx.core.errors import EngineError
 from cfx.core.threads import limit_cores, own_cores
 from cfx_dask.engine.code import differing, installed_code

@@ -11,11 +11,10 @@ import numpy as np
 
 from cfx.core.files import atomic_write
 from cfx.evaluation.result import Evaluation
+from cfx.figures.figure import Results
+from cfx.figures.text import COLOURS, label
+from cfx.figures.write import embedded_json, inline_scripts, security_policy
 from cfx.policies.agent import Agent
-from cfx.report.figures.figure import Results
-from cfx.report.figures.text import label
-from cfx.report.page import embedded_json, inline_scripts, security_policy
-from cfx.results.look import COLOURS
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
 from cfx_sumo.demo.simulated import Array, SimulatedPair
@@ -154,8 +153,8 @@ class _Plot(NamedTuple):
 
 def _plots(evaluation: Evaluation) -> list[_Plot]:
     """Draws each pair; the axes' places are where the page puts its line of time."""
-    from cfx.report.figures.trajectories import draw_pair
-    from cfx.report.figures.write import PLACE, inline_svg
+    from cfx.figures.trajectories import draw_pair
+    from cfx.figures.write import PLACE, inline_svg
 
     results = Results.of(evaluation)
     found = []

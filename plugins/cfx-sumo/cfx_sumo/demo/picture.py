@@ -12,12 +12,11 @@ from matplotlib.patches import FancyBboxPatch, Patch
 from matplotlib.transforms import Affine2D
 
 from cfx.evaluation.result import Evaluation
-from cfx.report.figures.canvas import canvas, styled
-from cfx.report.figures.figure import Results
-from cfx.report.figures.text import label, short
-from cfx.report.figures.trajectories import drives
-from cfx.report.figures.write import write_figure
-from cfx.results.look import COLOURS, INK
+from cfx.figures.canvas import canvas, styled
+from cfx.figures.figure import Results
+from cfx.figures.text import COLOURS, INK, label, short
+from cfx.figures.trajectories import drives
+from cfx.figures.write import write_figure
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
 from cfx_sumo.demo.simulated import Array, SimulatedPair

@@ -1,0 +1,163 @@
+"""What a figure of a job is: what it shows of the results, how it is drawn, what is said of it.
+
+An entry point of the group `cfx.figures` makes it known; its name becomes that of the figure's
+files.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, ClassVar
+
+import pandas as pd
+
+from cfx.core import registry
+from cfx.core.component import Component
+from cfx.core.errors import PluginError
+from cfx.evaluation.result import Purpose
+from cfx.simulation.trajectory import TRANSIENT_S
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from cfx.data.style import StyleResult
+    from cfx.evaluation.result import Evaluation, PairTrajectory
+    from cfx.evaluation.statistics import Improvement
+
+
+@dataclass(frozen=True)
+class ParameterAxis:
+    """A tuned parameter: its name, its unit, and the bounds within which policies choose.
+
+    `meaning` says in words what it is.
+    """
+
+    name: str
+    unit: str = ""
+    low: float | None = None
+    high: float | None = None
+    meaning: str = ""
+
+
+def parameter_axes(evaluation: Evaluation) -> tuple[ParameterAxis, ...]:
+    """Returns the tuned parameters of an evaluation."""
+    axes = []
+    for one in evaluation.parameters:
+        axes.append(ParameterAxis(one.name, one.unit, one.low, one.high, one.meaning))
+    return tuple(axes)
+
+
+@dataclass(frozen=True)
+class Results:
+    """What a finished job has measured; a running job and a report make it, each of what it has.
+
+    Attributes:
+        pairs: a row per pair and method, as in `pairs.csv`.
+        methods: those that are shown, in their order; without the policy if it does not adapt.
+        parameters: the tuned ones.
+        trajectories: test parts of all pairs; empty if none are known.
+        improvements: of the policy by baseline; empty where that is not the job's purpose.
+        style: of the drivers; None if it is not known. Without weights these are not known.
+        tables: what the job has written, by name (`cfx.results.table`): of `curves`, `platoon`,
+            `history`, `forecasts`, `slices`, `fits`, `labels` and those of plugins, what there is.
+        metrics: of the job, under their names in `metrics.json`.
+        transient_s: length of the transient at the beginning of the test part, s.
+    """
+
+    pairs: pd.DataFrame
+    methods: tuple[str, ...]
+    parameters: tuple[ParameterAxis, ...]
+    trajectories: Sequence[PairTrajectory] = ()
+    improvements: Mapping[str, Improvement] = field(default_factory=dict)
+    style: StyleResult | None = None
+    tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
+    transient_s: float = TRANSIENT_S
+
+    @classmethod
+    def of(
+        cls,
+        evaluation: Evaluation,
+        *,
+        style: StyleResult | None = None,
+        tables: Mapping[str, pd.DataFrame] | None = None,
+        metrics: Mapping[str, float] | None = None,
+    ) -> Results:
+        """Returns the results of an evaluation and of the tables that a job has made.
+
+        Args:
+            evaluation: of the job.
+            style: as in the attributes.
+            tables: what the job has written, by name.
+            metrics: as in the attributes; None: those of the evaluation alone.
+        """
+        shown = evaluation.distinct_methods()
+        improvements: Mapping[str, Improvement] = {}
+        if evaluation.purpose is Purpose.ADAPTATION:
+            improvements = evaluation.improvements["test"]
+        return cls(
+            pairs=shown.table,
+            methods=shown.methods,
+            parameters=parameter_axes(evaluation),
+            trajectories=evaluation.trajectories,
+            improvements=improvements,
+            style=style,
+            tables=tables or {},
+            metrics=evaluation.metrics() if metrics is None else metrics,
+        )
+
+
+class JobFigure(Component):
+    """A figure of a finished job, the same in its folder and in reports.
+
+    Attributes:
+        title: what it shows, in a few words, for readers who do not see it too.
+        caption: sentences that a reader needs to read it.
+        order: its place among the figures of a job; smaller numbers come first.
+    """
+
+    kind = "figure"
+    title: ClassVar[str] = ""
+    caption: ClassVar[str] = ""
+    order: ClassVar[int] = 1000
+
+    @classmethod
+    def complaint(cls) -> str:
+        """Returns what is wrong with what a class declares; "" if nothing is."""
+        return "" if cls.title and cls.caption else " has no title or no caption; give it both"
+
+    @abstractmethod
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it, with `cfx.figures.canvas.canvas` as its paper.
+
+        It is called in the common look. A figure belongs to no window (`pyplot` is not used) and
+        the same results give the same figure.
+
+        Returns:
+            None where the results hold nothing of what it shows.
+        """
+
+
+def figure_named(name: str) -> registry.Installed[JobFigure]:
+    """Return the figure of a name.
+
+    Raises:
+        PluginError: there is none that works.
+    """
+    for one in registry.installed("figure"):
+        if one.name == name:
+            return one
+    raise PluginError(f"there is no figure '{name}'")
+
+
+def draw(one: registry.Installed[JobFigure], results: Results) -> Figure | None:
+    """Return a figure in the common look; None where there is nothing to show, or it fails."""
+    from cfx.figures.canvas import figure_style
+
+    def attempt(figure: JobFigure) -> Figure | None:
+        with figure_style():
+            return figure.draw(results)
+
+    return one.attempt(attempt, None)

@@ -1,0 +1,430 @@
+"""Improvements of the policy: pair by pair, and by the history that it has read."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from cfx.evaluation.statistics import Improvement
+from cfx.figures.canvas import (
+    Array,
+    Dash,
+    canvas,
+    finite,
+    hover,
+    legend_above,
+    percent_axis,
+    points,
+    say,
+    styled,
+)
+from cfx.figures.figure import JobFigure, Results
+from cfx.figures.text import (
+    COLOURS,
+    INK,
+    common_prefix,
+    label,
+    percent,
+    percent_or_undefined,
+    plural,
+    short,
+)
+
+WORST_WITHOUT_CUT = -0.6
+"""Improvements above this are never cut off, however far they lie from the others."""
+
+_FAR_OUT = 3.0
+_MARGIN = 0.07
+
+
+@dataclass(frozen=True)
+class ImprovementAxis:
+    """An axis of improvements, fractions.
+
+    Attributes:
+        low, high: its ends; what is lower than `low` is cut off there.
+        title: what the axis is of.
+        note: a sentence if something is cut off or undefined, else "".
+    """
+
+    low: float
+    high: float
+    title: str
+    note: str
+
+
+@dataclass(frozen=True)
+class ImprovementSeries:
+    """The pairs of one job.
+
+    Attributes:
+        name: of the job.
+        pair_ids: P pairs whose improvement is defined.
+        values: `(P,)` improvements.
+        shown: `(P,)`, how far the bars reach: those below the axis end at its lower end.
+        clipped: `(P,)` bool, which are cut off.
+    """
+
+    name: str
+    pair_ids: tuple[str, ...]
+    values: Array
+    shown: Array
+    clipped: np.ndarray
+
+
+@dataclass(frozen=True)
+class ImprovementBars:
+    """Improvement of every pair, of one job or of several.
+
+    Attributes:
+        series: the jobs.
+        axis: common to all.
+        undefined: number of improvements that are not defined.
+    """
+
+    series: tuple[ImprovementSeries, ...]
+    axis: ImprovementAxis
+    undefined: int
+
+
+def improvement_title(baseline: str) -> str:
+    """Returns what an axis of improvements over a baseline is called."""
+    return f"improvement of the RMSE of speed over {label(baseline)}"
+
+
+def improvement_axis(
+    values: Array, marks: Sequence[float] = (), *, baseline: str, what: str = "improvements"
+) -> ImprovementAxis:
+    """Chooses an axis that a few very bad improvements do not shrink.
+
+    The rule: an improvement is cut off if it lies further below the lower quartile than three times
+    the distance between the quartiles (Tukey's far-out values), and only if it is worse than -60 %.
+
+    Args:
+        values: all improvements that are shown, fractions; those that are not finite do not count.
+        marks: further values that should be in view, such as the mean and the ends of its interval;
+            one far below the fence does not move the axis.
+        baseline: the method that the policy is compared with.
+        what: what is cut off, in the note.
+    """
+    title, known = improvement_title(baseline), finite(values)
+    undefined = len(np.asarray(values).ravel()) - len(known)
+    if not len(known):
+        note = f"No pair has a defined improvement ({undefined} are undefined)."
+        return ImprovementAxis(-1.0, 1.0, title, note)
+    q1, q3 = np.quantile(known, [0.25, 0.75])
+    fence = min(float(q1 - _FAR_OUT * (q3 - q1)), WORST_WITHOUT_CUT)
+    lowest = float(known.min())
+    # The mean and its interval stay in view as long as they do not dwarf the bars themselves.
+    near = [mark for mark in finite(marks) if mark > _FAR_OUT * fence]
+    low = min([max(lowest, fence), 0.0, *near])
+    high = max([float(known.max()), 0.0, *finite(marks)])
+    margin = _MARGIN * max(high - low, 0.1)
+    if lowest >= fence:
+        low -= margin
+    count = int((known < low).sum())
+    parts = []
+    if count:
+        parts.append(
+            f"The axis is cut at {percent(low)}: {count} of {len(known)} {what} are lower,"
+            f" the lowest is {percent(lowest)}."
+        )
+    if undefined:
+        parts.append(f"{plural(undefined, 'improvement')} not defined and not shown.")
+    return ImprovementAxis(low, high + margin, title, " ".join(parts))
+
+
+def vertical_improvements(axes: Axes, axis: ImprovementAxis) -> None:
+    """Make the vertical axis one of improvements."""
+    axes.set_ylim(axis.low, axis.high)
+    axes.set_ylabel(axis.title.replace(" over ", "\nover ") + " (%)")
+    percent_axis(axes)
+
+
+def improvement_bars(
+    names: Sequence[str],
+    pair_ids: Sequence[Sequence[str]],
+    improvements: Sequence[Array],
+    *,
+    baseline: str = "fixed",
+    marks: Sequence[float] = (),
+) -> ImprovementBars:
+    """Chooses the bars of every pair, best to worst in each job.
+
+    Args:
+        names: of J jobs.
+        pair_ids: of each job's pairs.
+        improvements: of each job's pairs, fractions.
+        baseline: the method that the policy is compared with.
+        marks: as in `improvement_axis`.
+    """
+    every = np.concatenate([np.empty(0), *improvements])
+    axis = improvement_axis(every, marks, baseline=baseline)
+    series = []
+    for name, ids, values in zip(names, pair_ids, improvements, strict=True):
+        series.append(_series(name, ids, np.asarray(values, dtype=np.float64), axis.low))
+    return ImprovementBars(tuple(series), axis, int((~np.isfinite(every)).sum()))
+
+
+def _series(name: str, pair_ids: Sequence[str], values: Array, low: float) -> ImprovementSeries:
+    defined = np.flatnonzero(np.isfinite(values))
+    order = defined[np.argsort(-values[defined], kind="stable")]
+    kept = values[order]
+    ids = tuple(str(pair_ids[index]) for index in order)
+    return ImprovementSeries(name, ids, kept, np.maximum(kept, low), kept < low)
+
+
+_NAMED = 40
+"""Up to so many bars carry their pair's name."""
+
+_LABELLED = 8
+"""Up to so many bars that are cut off carry their value; of more, only the worst."""
+
+
+@styled
+def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
+    """Draws sorted bars of every pair's improvement with mean, 95 % interval, trimmed mean, median.
+
+    A bar has the colour of the method that was closer to the driver. Bars that are cut off end in
+    an arrow with the value. Pairs without a defined improvement are counted in the axis label.
+
+    Args:
+        bars: of one job.
+        summary: statistics over the pairs.
+    """
+    (series,) = bars.series
+    named = len(series.pair_ids) <= _NAMED
+    prefix = common_prefix(list(series.pair_ids))
+    ticks = []
+    for name in series.pair_ids:
+        ticks.append(short(name.removeprefix(prefix), 16))
+    longest = max(map(len, ticks), default=0) if named else 0
+    figure = canvas(4.3 + 0.075 * longest)
+    axes = figure.subplots()
+    vertical_improvements(axes, bars.axis)
+    _bars(axes, series, bars.axis.low)
+    handles = _closer(series) + _statistics(axes, summary, bars.axis.low)
+    # A few bars stand in the middle, and no broader than those of a larger job.
+    count = len(series.values)
+    middle, half = (count - 1) / 2, max(count, 8) / 2 + 0.3
+    axes.set_xlim(middle - half, middle + half)
+    axes.grid(visible=False, axis="x")
+    if named:
+        axes.set_xticks(np.arange(count), ticks, rotation=90, fontsize=points(8.5))
+        axes.tick_params(axis="x", length=0)
+    else:
+        axes.set_xticks([])
+    axes.set_xlabel(_pairs_title(bars, prefix if named else ""))
+    if not count:
+        say(axes, "no pair has a defined improvement")
+    legend_above(figure, handles, columnspacing=1.8, handlelength=1.8)
+    return figure
+
+
+def _bars(axes: Axes, series: ImprovementSeries, low: float) -> None:
+    places = np.arange(len(series.values))
+    colours = np.where(series.values > 0, COLOURS["policy"], COLOURS["fixed"]).tolist()
+    drawn = axes.bar(places, series.shown, width=0.82, color=colours)
+    for bar, pair, value in zip(drawn, series.pair_ids, series.values, strict=True):
+        hover(bar, f"pair {pair}: {percent(float(value), 1)}")
+    axes.axhline(0, color=INK, linewidth=0.9)
+    cut = np.flatnonzero(series.clipped)
+    arrow = low + 0.035 * (axes.get_ylim()[1] - low)
+    for index in cut:
+        axes.plot(places[index], arrow, marker="v", color="white", markersize=5, zorder=4)
+        if len(cut) <= _LABELLED or index == cut[-1]:
+            axes.annotate(
+                percent(float(series.values[index])),
+                (float(places[index]), low),
+                (0, 14),
+                textcoords="offset points",
+                ha="center",
+                va="bottom",
+                rotation=90,
+                color="white",
+                fontsize=points(9),
+                fontweight="bold",
+                zorder=5,
+            )
+
+
+def _closer(series: ImprovementSeries) -> list[Line2D | Patch]:
+    policy = int((series.values > 0).sum())
+    others = len(series.values) - policy
+    return [
+        Patch(color=COLOURS["policy"], label=f"policy closer to the driver: {policy}"),
+        Patch(color=COLOURS["fixed"], label=f"{label('fixed')} closer, or equal: {others}"),
+    ]
+
+
+def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | Patch]:
+    """Draws the summary's lines and returns their legend entries, which carry the numbers."""
+    handles: list[Line2D | Patch] = []
+    ends = (summary.ci95_low, summary.ci95_high)
+    if np.isfinite(ends).all():
+        axes.axhspan(*ends, color="#000000", alpha=0.13, linewidth=0, zorder=0.5)
+        text = f"95 % interval of the mean: {percent(ends[0], 1)} to {percent(ends[1], 1)}"
+        handles.append(Patch(color="#000000", alpha=0.13, label=text))
+    lines: tuple[tuple[str, float, Dash, float], ...] = (
+        ("mean", summary.mean, "solid", 1.8),
+        ("trimmed mean", summary.trimmed_mean, (0, (5, 1.8)), 1.4),
+        ("median", summary.median, (0, (1.2, 1.4)), 1.6),
+    )
+    for name, value, dash, width in lines:
+        text = f"{name} {percent_or_undefined(value, 1)}"
+        if np.isfinite(value):
+            axes.axhline(value, color="black", linestyle=dash, linewidth=width, zorder=3)
+        if value < low:
+            text += " (below the axis)"
+        handles.append(Line2D([], [], color="black", linestyle=dash, linewidth=width, label=text))
+    return handles
+
+
+def _pairs_title(bars: ImprovementBars, prefix: str) -> str:
+    title = plural(len(bars.series[0].values), "pair")
+    if prefix:
+        title += f" of {short(prefix.rstrip('_-/:.'), 30)}"
+    title += ", best to worst"
+    if bars.undefined:
+        title += f"; {bars.undefined} without a defined improvement"
+    return title
+
+
+class ImprovementPerDriver(JobFigure):
+    """The policy's improvement of every pair, best to worst."""
+
+    title = "Improvement of every pair over driver-specific calibration"
+    caption = (
+        "A bar per pair, in the colour of the method that was closer to the driver, with mean,"
+        " trimmed mean, median and the 95 % interval of the mean."
+    )
+    order = 10
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where a policy adapts."""
+        if "fixed" not in results.improvements:
+            return None
+        return draw_improvement(results, "fixed", "improvement")
+
+
+def draw_improvement(results: Results, baseline: str, column: str) -> Figure:
+    """Draws the improvement of every pair over a baseline, which `column` of the pairs holds."""
+    rows = results.pairs[results.pairs["method"] == "policy"]
+    summary = results.improvements[baseline]
+    bars = improvement_bars(
+        [""],
+        [rows["pair_id"].astype(str).tolist()],
+        [rows[column].to_numpy(dtype=float)],
+        baseline=baseline,
+        marks=(summary.mean, summary.ci95_low, summary.ci95_high),
+    )
+    return draw_improvements(bars, summary)
+
+
+BASES = {"own": "fixed", "population": "population"}
+"""The method whose colour a base has: the parameters that the policy's answers are offsets from."""
+
+BASE_LABELS = {
+    "own": "offsets from driver-specific calibration",
+    "population": "offsets from pooled calibration",
+}
+
+
+def history_curves(history: pd.DataFrame) -> pd.DataFrame:
+    """Return the improvement over driver-specific calibration by base and amount of burn-in.
+
+    Args:
+        history: as `Evaluation.history`.
+
+    Returns:
+        A row per base and amount, each in its order: `base`, `amount`, `mean`, `low` and `high`
+        (fractions; mean over pairs and its 95 % interval), `pairs` with a defined improvement.
+    """
+    from cfx.evaluation.statistics import mean_interval  # imports scipy
+
+    rows = []
+    for base in sorted(history["base"].unique(), key=_place_of_base):
+        for amount in amounts_of(history):
+            chosen = history[(history["base"] == base) & (history["amount"] == amount)]
+            if len(chosen):
+                gains = chosen["improvement"].astype(float).tolist()
+                interval = mean_interval(gains, chosen["driver"].astype(str).tolist(), seed=0)
+                rows.append((str(base), amount, *interval, int(np.isfinite(gains).sum())))
+    return pd.DataFrame(rows, columns=["base", "amount", "mean", "low", "high", "pairs"])
+
+
+def amounts_of(history: pd.DataFrame) -> list[str]:
+    """Returns the amounts of history in words, the smallest first; a share comes after seconds."""
+    longest = history.groupby("amount")["history_s"].max()
+    return sorted(
+        (str(amount) for amount in longest.index),
+        key=lambda amount: (amount.endswith("%"), longest[amount]),
+    )
+
+
+def _place_of_base(base: str) -> tuple[int, str]:
+    known = list(BASES)
+    return (known.index(base) if base in known else len(known), base)
+
+
+@styled
+def draw_history(history: pd.DataFrame) -> Figure:
+    """Draw the mean improvement and its 95 % interval against the amount of burn-in.
+
+    Args:
+        history: as `Evaluation.history`.
+    """
+    figure = canvas(3.9)
+    axes = figure.subplots()
+    amounts, curves = amounts_of(history), history_curves(history)
+    bases = curves["base"].unique()
+    for k, base in enumerate(bases):
+        curve = curves[curves["base"] == base]
+        aside = 0.06 * (k - 0.5 * (len(bases) - 1))
+        places = np.array([amounts.index(amount) for amount in curve["amount"]]) + aside
+        mean, low, high = (curve[name].to_numpy(dtype=float) for name in ("mean", "low", "high"))
+        axes.errorbar(
+            places,
+            mean,
+            np.nan_to_num(np.stack([mean - low, high - mean])),
+            color=COLOURS.get(BASES.get(base, ""), INK),
+            marker="o",
+            linewidth=1.8,
+            capsize=4,
+            label=BASE_LABELS.get(base, base),
+        )
+    axes.axhline(0, color=INK, linewidth=0.9)
+    axes.set_xticks(range(len(amounts)), amounts)
+    axes.set_xlim(-0.4, len(amounts) - 0.6)
+    axes.set_xlabel("burn-in: measured history before the test part")
+    axes.set_ylabel(improvement_title("fixed").replace(" over ", "\nover ") + " (%)")
+    percent_axis(axes)
+    title = "mean over pairs and its 95 % interval"
+    legend_above(figure, columns=2, title=title)
+    return figure
+
+
+class History(JobFigure):
+    """What a policy gains from the measured history before the test part."""
+
+    title = "Improvement by the amount of burn-in"
+    caption = (
+        "Before the test part, the policy is fed with measured history of the driver, its burn-in."
+        " Here the same test part after less and after more of it: mean improvement over"
+        " driver-specific calibration, with its 95 % interval."
+    )
+    order = 100
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where the history was varied."""
+        table = results.tables.get("history")
+        if table is None:
+            return None
+        return draw_history(table)

@@ -1,0 +1,149 @@
+"""Driving style by site: scores, what they are made of, and how far apart sites are."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from cfx.data.site_styles import ALL, Group, groups
+from cfx.data.style import INDICATORS, StyleResult, name_of_indicator
+from cfx.figures.canvas import Array, canvas, hover, most_across, points, styled
+from cfx.figures.figure import JobFigure, Results
+from cfx.figures.text import INK, JOB_COLOURS
+
+_ACROSS = 4
+_VIOLIN = 8
+"""Drivers from which on their distribution is drawn beside them."""
+
+_TYPE_COLOUR = "#9a9a9a"
+
+
+@styled
+def draw_site_styles(style: StyleResult, distances: pd.DataFrame | None) -> Figure:
+    """Draws a panel for the score and for each indicator, a row per group of drivers.
+
+    Every driver is a dot; the thick line is from the lower to the upper quartile, the mark the
+    median. The last panel has the distances between sites.
+
+    Args:
+        style: of the drivers of at least two sites.
+        distances: as `cfx.data.site_styles.style_distances`.
+    """
+    shown = groups(style.table)
+    across = most_across(_ACROSS)
+    panels = len(INDICATORS) + 2
+    rows = -(-panels // across)
+    figure = canvas(rows * (1.1 + 0.24 * len(shown)))
+    grid = figure.subplots(rows, across, squeeze=False)
+    axes = list(grid.flat)
+    _panel(
+        axes[0],
+        style.table["score"].to_numpy(dtype=float),
+        shown,
+        "style score\n0 conservative, 1 aggressive",
+    )
+    for panel, indicator in zip(axes[1:], INDICATORS, strict=False):
+        values = style.table[indicator.name].to_numpy(dtype=float)
+        unit = indicator.unit.replace("2", "²").replace("4", "⁴")
+        title = f"{name_of_indicator(indicator.name)}\n{unit}"
+        if indicator.name in style.weights:
+            title += f"; weight {style.weights[indicator.name]:.2f}"
+        _panel(panel, values, shown, title)
+    for number, panel in enumerate(axes[: panels - 1]):
+        if number % across:
+            panel.set_yticklabels([])
+    _matrix(axes[panels - 1], shown, distances)
+    for unused in axes[panels:]:
+        unused.set_visible(False)
+    return figure
+
+
+def _panel(axes: Axes, values: Array, shown: Sequence[Group], title: str) -> None:
+    sites = list(dict.fromkeys(group.site for group in shown))
+    scatter = np.random.default_rng(0)
+    for place, group in enumerate(shown):
+        mine = values[group.chosen & np.isfinite(values)]
+        whole = group.driver_type == ALL
+        colour = JOB_COLOURS[sites.index(group.site) % len(JOB_COLOURS)] if whole else _TYPE_COLOUR
+        if len(mine) >= _VIOLIN and np.ptp(mine) > 0:
+            violin = axes.violinplot(
+                mine, [place], orientation="horizontal", widths=0.85, showextrema=False
+            )
+            for body in violin["bodies"]:  # type: ignore[attr-defined]  # the stub says Collection
+                body.set(facecolor=colour, alpha=0.25, linewidth=0)
+        if not len(mine):
+            continue
+        spread = scatter.uniform(-0.16, 0.16, len(mine)) if len(mine) > 1 else np.zeros(1)
+        axes.plot(
+            mine, place + spread, ".", color=colour, markersize=points(2.5), alpha=0.55, mew=0
+        )
+        low, middle, high = np.quantile(mine, [0.25, 0.5, 0.75])
+        axes.plot([low, high], [place, place], color=colour, linewidth=points(2.2))
+        (mark,) = axes.plot(
+            middle, place, "o", color=colour, markeredgecolor="white", markersize=points(6)
+        )
+        hover(mark, f"{_called(group)}: median {middle:.3g}, {len(mine)} drivers")
+    axes.set_yticks(range(len(shown)), [_called(group) for group in shown])
+    for tick, group in zip(axes.get_yticklabels(), shown, strict=True):
+        tick.set_fontweight("bold" if group.driver_type == ALL else "normal")
+    axes.set_ylim(len(shown) - 0.4, -0.6)
+    axes.set_title(title, fontsize=points(9.5))
+    axes.xaxis.set_major_locator(MaxNLocator(4))
+    axes.tick_params(axis="y", length=0)
+    axes.grid(visible=False, axis="y")
+
+
+def _called(group: Group) -> str:
+    return group.site if group.driver_type == ALL else group.driver_type
+
+
+def _matrix(axes: Axes, shown: Sequence[Group], distances: pd.DataFrame | None) -> None:
+    """Draws the distances between the scores of sites; pale where chance may explain them."""
+    sites = [group.site for group in shown if group.driver_type == ALL]
+    number = {site: index for index, site in enumerate(sites)}
+    matrix = np.full((len(sites), len(sites)), np.nan)
+    p_values = np.ones_like(matrix)
+    if distances is not None:
+        for _, row in distances[distances["driver_type"] == ALL].iterrows():
+            place = number[str(row["other_site"])], number[str(row["site"])]
+            matrix[place], p_values[place] = row["distance"], row["p_value"]
+    axes.imshow(np.ma.masked_invalid(matrix), cmap="Blues", vmin=0, aspect="auto")
+    largest = np.nanmax(matrix) if np.isfinite(matrix).any() else 1.0
+    for (row_number, column), value in np.ndenumerate(matrix):
+        if np.isfinite(value):
+            doubt = "" if p_values[row_number, column] < 0.05 else "\n(chance)"
+            ink = "white" if value > 0.6 * largest else INK
+            axes.text(
+                column, row_number, f"{value:.2f}{doubt}", ha="center", va="center", color=ink
+            )
+    axes.set_xticks(range(len(sites)), sites, rotation=30, ha="right")
+    axes.set_yticks(range(len(sites)), sites)
+    axes.set_xlim(-0.5, len(sites) - 1.5)
+    axes.set_ylim(len(sites) - 0.5, 0.5)
+    axes.grid(visible=False)
+    axes.tick_params(length=0)
+    axes.set_title("energy distance\nof the style scores", fontsize=points(9.5))
+
+
+class SiteStyles(JobFigure):
+    """Driving style by site and type of driver."""
+
+    title = "Driving style by site"
+    caption = (
+        "Style scores and the six indicators that they are made of, a dot per driver: the mark is"
+        " the median, the thick line goes from the lower to the upper quartile. Below each site, in"
+        " grey, its types of drivers. Distances between sites are energy distances of the scores;"
+        " (chance): a permutation of the drivers does not tell the sites apart."
+    )
+    order = 61
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where drivers of several sites are scored."""
+        if results.style is None or not groups(results.style.table):
+            return None
+        return draw_site_styles(results.style, results.tables.get("style_distances"))

@@ -1,0 +1,253 @@
+"""Text of figures and reports: names of methods, parts of trajectories, numbers, units."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from cfx.evaluation.metrics.base import SCOPES
+
+MINUS = "\N{MINUS SIGN}"
+NOTHING = "\N{EN DASH}"
+
+
+class MethodText(NamedTuple):
+    """What a method is called.
+
+    Attributes:
+        label: in legends.
+        short: in tables.
+        explained: in words that end a sentence.
+    """
+
+    label: str
+    short: str
+    explained: str
+
+
+METHOD_TEXTS: dict[str, MethodText] = {
+    "real": MethodText("real driver", "real", "the recorded drivers"),
+    "leader": MethodText("leader", "leader", "the recorded leader"),
+    "default": MethodText("default parameters", "default", "the model's default parameters"),
+    "population": MethodText(
+        "pooled calibration",
+        "pooled",
+        "pooled calibration, which is one set of parameters for all drivers, calibrated jointly"
+        " on the training drivers",
+    ),
+    "fixed": MethodText(
+        "driver-specific calibration",
+        "driver-specific",
+        "driver-specific calibration, which is one set of parameters for each driver, calibrated"
+        " on the first part of their own trajectory",
+    ),
+    "shrunk": MethodText(
+        "driver-specific, shrunk",
+        "shrunk",
+        "driver-specific calibration shrunk towards the default, which is where the policy starts"
+        " from",
+    ),
+    "policy": MethodText(
+        "policy", "policy", "parameters that the policy chooses anew in each window"
+    ),
+    "constant_speed": MethodText(
+        "constant speed", "constant speed", "the driver goes on at the speed that they have"
+    ),
+    "constant_acceleration": MethodText(
+        "constant acceleration",
+        "constant acceleration",
+        "the driver goes on at the acceleration that they have",
+    ),
+    "population_residual": MethodText(
+        "pooled, with residual",
+        "pooled + residual",
+        "pooled calibration, which takes over from the acceleration at the origin within seconds",
+    ),
+    "fixed_residual": MethodText(
+        "driver-specific, with residual",
+        "driver-specific + residual",
+        "driver-specific calibration, which takes over from the acceleration at the origin within"
+        " seconds",
+    ),
+    "population_ar": MethodText(
+        "pooled, with noise",
+        "pooled + noise",
+        "pooled calibration with auto-regressive noise on the acceleration, as measured on"
+        " recorded drivers",
+    ),
+    "fixed_ar": MethodText(
+        "driver-specific, with noise",
+        "driver-specific + noise",
+        "driver-specific calibration with auto-regressive noise on the acceleration, as measured"
+        " on the driver",
+    ),
+    "policy_sampled": MethodText(
+        "policy, sampled",
+        "policy, sampled",
+        "the policy with all that it leaves to chance, drawn with the job's seed",
+    ),
+}
+"""Methods and recorded vehicles."""
+
+FEW_DRIVERS = 20
+
+TEST, STEADY, FULL_TRAJECTORY = SCOPES
+"""Parts of trajectories that metrics are of."""
+
+
+def label(method: str) -> str:
+    """Returns how a legend names a method."""
+    return METHOD_TEXTS[method].label if method in METHOD_TEXTS else method
+
+
+def short_label(method: str) -> str:
+    """Returns how a table names a method."""
+    return METHOD_TEXTS[method].short if method in METHOD_TEXTS else method
+
+
+def explained(method: str) -> str:
+    """Returns what a method is, in words that end a sentence."""
+    return METHOD_TEXTS[method].explained if method in METHOD_TEXTS else method
+
+
+def percent(fraction: float, digits: int = 0) -> str:
+    """Returns a signed percentage with a real minus sign: 0.1234 -> "+12 %"."""
+    return f"{100 * fraction:+.{digits}f} %".replace("-", MINUS)
+
+
+def percent_or_undefined(fraction: float, digits: int = 0) -> str:
+    """Returns a signed percentage, or "undefined" where it is not finite."""
+    if not math.isfinite(fraction):
+        return "undefined"
+    return percent(fraction, digits)
+
+
+def number(value: float) -> str:
+    """Returns up to three significant digits, with a real minus sign."""
+    return f"{value:.3g}".replace("-", MINUS)
+
+
+def plural(count: int, noun: str) -> str:
+    """Returns "1 pair" or "3 pairs"."""
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def few_drivers(drivers: int) -> str:
+    """Returns a warning where statistics are over few drivers, else "".
+
+    A bootstrap interval over fewer than twenty is too narrow.
+    """
+    if not 0 < drivers < FEW_DRIVERS:
+        return ""
+    return (
+        f"{plural(drivers, 'driver')}: with fewer than {FEW_DRIVERS}, means and intervals say"
+        " little about other drivers."
+    )
+
+
+def short(name: str, limit: int = 26) -> str:
+    """Returns a name that fits, its middle left out if it is longer than `limit` characters."""
+    if len(name) <= limit:
+        return name
+    tail = (limit - 1) // 2
+    return f"{name[: limit - 1 - tail]}…{name[-tail:]}"
+
+
+def common_prefix(names: list[str]) -> str:
+    """Returns what all names start with, up to a separator: "i80-" of "i80-11-1" and "i80-12-7"."""
+    if len(names) < 2:
+        return ""
+    # The first and the last in alphabetical order differ earliest.
+    first, last = min(names), max(names)
+    same = 0
+    while same < min(len(first), len(last)) and first[same] == last[same]:
+        same += 1
+    end = 0
+    for separator in "_-/:.":
+        end = max(end, first.rfind(separator, 0, same) + 1)
+    return first[:end]
+
+
+def unit_label(name: str, unit: str) -> str:
+    """Returns an axis label such as "t_r (s)"; a pure number (unit "1" or "") has no bracket."""
+    return name if unit in {"", "1"} else f"{name} ({pretty_unit(unit)})"
+
+
+def pretty_unit(unit: str) -> str:
+    """Returns a unit with raised digits: "m/s2" -> "m/s²"."""
+    for plain, raised in (
+        ("1e-4", "10⁻⁴"),
+        ("m/s2", "m/s²"),
+        ("m2/s2", "m²/s²"),
+        ("m/s3", "m/s³"),
+    ):
+        unit = unit.replace(plain, raised)
+    return unit
+
+
+COLOURS = {
+    "real": "#000000",
+    "leader": "#9a9a9a",
+    "default": "#009e73",
+    "population": "#aa4499",
+    "fixed": "#0072b2",
+    "shrunk": "#7a5c3e",
+    "policy": "#d55e00",
+    "constant_speed": "#bdbdbd",
+    "constant_acceleration": "#666666",
+    "population_residual": "#dba6d0",
+    "fixed_residual": "#7fb8dc",
+    "population_ar": "#661155",
+    "fixed_ar": "#003f66",
+    "policy_sampled": "#b8860b",
+}
+OTHER_COLOUR = "#777777"
+"""A method of a protocol that cfx does not know."""
+
+CLUSTER_COLOURS = ("#56b4e9", "#8c8c8c", "#e69f00")
+"""Conservative, normal, aggressive: none of them a method's colour."""
+
+TRAIN_COLOUR, VALIDATION_COLOUR = "#56b4e9", "#cc79a7"
+COLLISION_COLOUR = "#d00000"
+INK = "#333333"
+PALE = "#e4e4e4"
+BAND = "#f3f3f3"
+EDGE = "#808080"
+
+JOB_COLOURS = (
+    "#332288",
+    "#cc6677",
+    "#117733",
+    "#ddaa33",
+    "#88ccee",
+    "#882255",
+    "#44aa99",
+    "#999933",
+    "#777777",
+)
+"""Tol's muted colours, told apart by readers with any colour vision, none a method's."""
+
+_VEHICLES = (
+    "#440154",
+    "#482576",
+    "#404588",
+    "#34618d",
+    "#297a8e",
+    "#20928c",
+    "#25ac82",
+    "#4cc26c",
+    "#86d549",
+    "#cae11f",
+)
+"""The colour map viridis from dark to light."""
+
+
+def colour_of(method: str) -> str:
+    """Returns the colour of a method or of a recorded vehicle."""
+    return COLOURS.get(method, OTHER_COLOUR)
+
+
+def vehicle_colour(vehicle: int, vehicles: int) -> str:
+    """Returns the colour of follower `vehicle` (1 and up) of `vehicles`, from dark to light."""
+    place = (vehicle - 1) * (len(_VEHICLES) - 1) / max(vehicles - 1, 1)
+    return _VEHICLES[round(place)]

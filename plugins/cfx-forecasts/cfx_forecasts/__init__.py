@@ -1,0 +1,1 @@
+"""Forecasts of single drivers from every moment of their trajectories."""

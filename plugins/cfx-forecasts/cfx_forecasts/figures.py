@@ -1,0 +1,301 @@
+"""Errors over time: of simulations since the test part began, of forecasts by horizon; samples."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from cfx.evaluation.result import PairTrajectory
+from cfx.figures.canvas import (
+    DASHES,
+    HIDDEN,
+    Array,
+    Line,
+    canvas,
+    draw_lines,
+    logarithmic,
+    mark_points,
+    method_legend,
+    side_by_side,
+    styled,
+)
+from cfx.figures.figure import JobFigure, Results
+from cfx.figures.text import EDGE, INK, colour_of
+from cfx_forecasts.distributions import (
+    LEVEL,
+    centre_errors,
+    sampled_methods,
+    summarize_distributions,
+)
+from cfx_forecasts.errors import errors_by, errors_by_history, forecast_methods
+
+HORIZON_TITLE = "horizon (s)"
+HISTORY_TITLE = "measured history (s)"
+PIT_BINS = 10
+
+_ERRORS = (("rmse_speed", "RMSE of speed (m/s)"), ("rmse_position", "RMSE of position (m)"))
+_PANELS = 3
+
+
+@styled
+def draw_by_horizon(summary: pd.DataFrame, methods: Sequence[str]) -> Figure:
+    """Draw errors of speed and of position against the horizon.
+
+    Args:
+        summary: as `summarize_forecasts` returns it.
+        methods: those to show.
+    """
+    figure = canvas(4.4)
+    for axes, (error, title) in zip(side_by_side(figure, [1] * len(_ERRORS)), _ERRORS, strict=True):
+        _draw_panel(axes, _lines(summary, methods, "horizon_s", error), title, HORIZON_TITLE)
+        logarithmic(axes)
+    method_legend(figure, methods)
+    return figure
+
+
+@styled
+def draw_by_history(by_history: pd.DataFrame, methods: Sequence[str]) -> Figure:
+    """Draw a panel for a short, a middle and a long horizon.
+
+    Args:
+        by_history: as `errors_by_history` returns it.
+        methods: those to show.
+    """
+    horizons = sorted(by_history["horizon_s"].unique())
+    chosen = sorted({horizons[0], horizons[len(horizons) // 2], horizons[-1]})[:_PANELS]
+    figure = canvas(4.4)
+    grid = side_by_side(figure, [1] * len(chosen))
+    for axes, horizon in zip(grid, chosen, strict=True):
+        rows = by_history[by_history["horizon_s"] == horizon]
+        title = f"RMSE of speed after {horizon:g} s (m/s)"
+        _draw_panel(axes, _lines(rows, methods, "span_s", "rmse_speed"), title, HISTORY_TITLE)
+        axes.set_ylim(bottom=0)
+    method_legend(figure, methods)
+    return figure
+
+
+def _lines(table: pd.DataFrame, methods: Sequence[str], against: str, error: str) -> list[Line]:
+    lines = []
+    for method in methods:
+        rows = table[table["method"] == method].sort_values(against)
+        seconds = rows[against].to_numpy(dtype=float)
+        lines.append(Line(method, seconds, rows[error].to_numpy(dtype=float)))
+    return lines
+
+
+def _draw_panel(axes: Axes, lines: Sequence[Line], title: str, against: str) -> None:
+    draw_lines(axes, lines)
+    mark_points(axes)
+    axes.set_xlabel(against)
+    axes.set_ylabel(title)
+
+
+def sampled_name(method: str) -> str:
+    """Return what a sampled method is called beside the policy's centre, which is `policy`."""
+    return "policy_sampled" if method == "policy" else method
+
+
+def pit_density(rows: pd.DataFrame) -> Array:
+    """Return the histogram of the PIT of one method, `(PIT_BINS,)`, in which drivers count alike.
+
+    Where reality lies among the sampled speeds, from 0 to 1; 1 everywhere if all is well.
+    """
+    found = []
+    for _, of_driver in rows.groupby("driver"):
+        counts, _ = np.histogram(of_driver["pit"], bins=PIT_BINS, range=(0.0, 1.0))
+        found.append(PIT_BINS * counts / max(1, counts.sum()))
+    return np.asarray(np.mean(found, axis=0))
+
+
+@styled
+def draw_distributions(table: pd.DataFrame, forecasts: pd.DataFrame) -> Figure:
+    """Draw CRPS and coverage against the horizon, and the PIT of the horizon nearest to 3 s.
+
+    Args:
+        table: as `score_distributions` returns it.
+        forecasts: single ones of the same origins; the policy's centre is in the first panel, with
+            its absolute error.
+    """
+    figure = canvas(4.2)
+    crps, coverage, pit = side_by_side(figure, (1, 1, 1))
+    summary = summarize_distributions(table)
+    summary["method"] = summary["method"].astype(str).map(sampled_name)
+    sampled = sampled_methods(table)
+    names = [sampled_name(method) for method in sampled]
+    centre = centre_errors(forecasts).assign(method="policy")
+    crps_lines = _lines(summary, names, "horizon_s", "crps_speed")
+    crps_lines += _lines(centre, ["policy"], "horizon_s", "crps_speed")
+    _draw_panel(crps, crps_lines, "CRPS of speed (m/s)", HORIZON_TITLE)
+    logarithmic(crps)
+    title = f"share within the central {100 * LEVEL:.0f} %"
+    _draw_panel(coverage, _lines(summary, names, "horizon_s", "coverage"), title, HORIZON_TITLE)
+    coverage.axhline(LEVEL, color=EDGE, linewidth=1.0, zorder=1)
+    coverage.set_ylim(0.0, 1.0)
+    horizon = min(sorted(table["horizon_s"].unique()), key=lambda seconds: abs(seconds - 3.0))
+    here = table[table["horizon_s"] == horizon]
+    for method, name in zip(sampled, names, strict=True):
+        pit.stairs(
+            pit_density(here[here["method"] == method]),
+            [k / PIT_BINS for k in range(PIT_BINS + 1)],
+            color=colour_of(name),
+            linestyle=DASHES.get(name, "solid"),
+            linewidth=1.6,
+        )
+    pit.axhline(1.0, color=EDGE, linewidth=1.0, zorder=1)
+    pit.set_xlabel("share of samples below reality")
+    pit.set_ylabel(f"density, {horizon:g} s ahead")
+    pit.set_ylim(bottom=0)
+    method_legend(figure, [*names, "policy"])
+    return figure
+
+
+class ForecastErrors(JobFigure):
+    """Errors of forecasts against their horizon."""
+
+    title = "Errors of forecasts against the horizon"
+    caption = (
+        "From each of many moments (origins) of the test trajectories, knowing what was measured up"
+        " to it, where will the driver be some seconds later? RMSE over the origins of each driver,"
+        " then the mean over drivers."
+    )
+    order = 110
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where forecasts were made."""
+        table = results.tables.get("forecasts")
+        if table is None:
+            return None
+        of_driver = errors_by(table, ["method", "horizon_s", "driver"])
+        grouped = of_driver.groupby(["method", "horizon_s"], sort=False, observed=True)
+        summary = grouped[[error for error, _ in _ERRORS]].mean().reset_index()
+        return draw_by_horizon(summary, forecast_methods(table))
+
+
+class ForecastsByHistory(JobFigure):
+    """Errors of forecasts against how much of a driver had been measured."""
+
+    title = "Errors of forecasts against the measured history"
+    caption = "The same forecasts, by how much of the driver had been measured before the origin."
+    order = 111
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where origins have so different histories that they can be told apart."""
+        table = results.tables.get("forecasts")
+        if table is None:
+            return None
+        by_history = errors_by_history(table)
+        if by_history["span_s"].nunique() < 2:
+            return None
+        return draw_by_history(by_history, forecast_methods(table))
+
+
+class Distributions(JobFigure):
+    """Sampled forecasts as distributions: CRPS, coverage, PIT."""
+
+    title = "CRPS, coverage and PIT of sampled forecasts"
+    caption = (
+        "The CRPS of speed is smallest, in the mean, for the distribution that reality is drawn"
+        " from. Coverage: the share of moments whose real speed lies in the central"
+        f" {100 * LEVEL:.0f} % of the sampled ones. The last panel has the share of sampled speeds"
+        " below the real one: flat if the spread is right, high at both ends if the paths are too"
+        " much alike. Means over drivers."
+    )
+    order = 112
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where forecasts were sampled."""
+        if not {"distributions", "forecasts"} <= set(results.tables):
+            return None
+        return draw_distributions(results.tables["distributions"], results.tables["forecasts"])
+
+
+TIME_TITLE = "time since the test part began (s)"
+
+_LEAST = 0.9
+"""Share of the pairs that a moment needs: with fewer, the errors would be other drivers'."""
+
+
+def errors_over_time(
+    trajectories: Sequence[PairTrajectory], method: str, signal: str
+) -> tuple[Array, Array]:
+    """Returns seconds since the test part began, and the RMSE over the pairs that last so long.
+
+    Args:
+        trajectories: test parts of P pairs.
+        method: who drives.
+        signal: `speed` (m/s) or `gap` (m).
+
+    Returns:
+        `(T,)` each; they end where a tenth of the pairs have ended.
+    """
+    longest = max(trajectories, key=lambda trajectory: len(trajectory.time))
+    squares = np.full((len(trajectories), len(longest.time)), np.nan)
+    for row, trajectory in zip(squares, trajectories, strict=True):
+        if signal == "speed":
+            simulated, real = trajectory.speed[method], trajectory.real_speed
+        else:
+            simulated, real = trajectory.gap[method], trajectory.real_gap
+        row[: len(real)] = (simulated - real) ** 2
+    frames = int((np.isfinite(squares).mean(axis=0) >= _LEAST).sum())
+    seconds: Array = longest.time[:frames] - longest.time[0]
+    return seconds, np.sqrt(np.nanmean(squares[:, :frames], axis=0))
+
+
+@styled
+def draw_errors(
+    trajectories: Sequence[PairTrajectory], methods: Sequence[str], transient_s: float
+) -> Figure:
+    """Draw RMSE of speed and of gap over all pairs at each moment since the test part began.
+
+    All methods begin in the measured state. Constant parameters leave it for their own gap at once,
+    so that a good part of what a policy gains may be gained in the first seconds: here it is seen.
+
+    Args:
+        trajectories: test parts of all pairs.
+        methods: those to show.
+        transient_s: where the transient ends, s; the errors after it are the metrics `steady/...`.
+    """
+    figure = canvas(3.9)
+    for axes, (signal, unit) in zip(
+        side_by_side(figure, (1, 1)), (("speed", "m/s"), ("gap", "m")), strict=True
+    ):
+        lines = []
+        for method in methods:
+            seconds, error = errors_over_time(trajectories, method, signal)
+            lines.append(Line(method, seconds, error))
+        draw_lines(axes, lines)
+        axes.set_xlabel(TIME_TITLE)
+        axes.set_ylabel(f"RMSE of {signal} over pairs ({unit})")
+        axes.set_ylim(bottom=0)
+        axes.axhline(0, color=INK, linewidth=0.9)
+        if any(line.time[-1:] > transient_s for line in lines):
+            axes.axvline(transient_s, color=EDGE, linewidth=0.9, linestyle=(0, (4, 2)))
+    method_legend(figure, methods)
+    return figure
+
+
+class ErrorOverTime(JobFigure):
+    """RMSE over all pairs at each moment since the test part began."""
+
+    title = "Errors over all pairs since the test part began"
+    caption = (
+        "RMSE of speed and of gap over all pairs at each moment since the test part began, as long"
+        " as nine in ten pairs last. All methods begin in the measured state; constant parameters"
+        " leave it for their own gap at once. The dashed line is the end of the transient."
+    )
+    order = 40
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where trajectories are known."""
+        if not len(results.trajectories):
+            return None
+        simulated = results.trajectories[0].speed
+        methods = []
+        for method in results.methods:
+            if method in simulated and method not in HIDDEN:
+                methods.append(method)
+        return draw_errors(results.trajectories, methods, results.transient_s)

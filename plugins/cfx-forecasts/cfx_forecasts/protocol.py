@@ -1,0 +1,308 @@
+"""Unseen drivers, forecast from every moment of their trajectories."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Annotated, Any, ClassVar
+
+import numpy as np
+import pandas as pd
+import torch
+from pydantic import AfterValidator, Field
+from torch import Tensor
+
+from cfx.core.component import Settings
+from cfx.core.errors import ConfigError, DataError
+from cfx.evaluation.closed_loop import Followers
+from cfx.evaluation.forecasts import (
+    LeaderFuture,
+    Origins,
+    Paths,
+    measured_paths,
+    sample_from_origins,
+)
+from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
+from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
+from cfx.evaluation.protocols.held_out import HeldOut
+from cfx.evaluation.tables import in_text
+from cfx.policies.agent import Agent
+from cfx.policies.fixed import FixedPolicy
+from cfx_forecasts.distributions import Recorded, score_distributions
+from cfx_forecasts.errors import forecast_errors, forecast_values, kinematic_paths
+from cfx_forecasts.noise import can_drive, constant_with_noise, residual_noise
+
+log = logging.getLogger(__name__)
+
+
+def _in_order(horizons: tuple[float, ...]) -> tuple[float, ...]:
+    if not all(horizon > 0 for horizon in horizons):
+        raise ValueError("horizons are seconds greater than 0")
+    return tuple(sorted(set(horizons)))
+
+
+class ForecastSettings(FoldsOrFinishedSettings):
+    """Settings of `forecast`."""
+
+    horizons: Annotated[tuple[float, ...], AfterValidator(_in_order)] = Field(
+        (0.5, 1.0, 2.0, 3.0, 5.0, 10.0),
+        min_length=1,
+        description="s: how far ahead errors are measured",
+    )
+    stride: float = Field(0.5, gt=0, description="s between the origins of a driver")
+    min_history: float | None = Field(
+        None,
+        gt=0,
+        description="s of measured history before a driver's first origin, on which driver-specific"
+        " parameters are calibrated; null: the share `split` of the trajectory",
+    )
+    leader: LeaderFuture = Field(
+        "given",
+        description="what is known of the leader after an origin: given: what they did;"
+        " constant_speed, constant_acceleration: they go on as at the origin",
+    )
+    samples: int = Field(
+        0,
+        ge=0,
+        le=1000,
+        description="paths sampled from each origin, of a stochastic policy and of constant"
+        " parameters with auto-regressive noise, for scores of distributions; 0: none",
+    )
+
+
+class Forecast(FoldsOrFinished):
+    """From every moment, knowing the past: where will a driver be in 0.5 to 10 s?
+
+    Folds, calibration and training are those of `across_drivers`, and so is the test part; with
+    `run` they are those of `transfer`, and nothing is trained. Beyond it, each test driver is
+    forecast from *origins*, one every `stride` s. At an origin all that was measured up to it may
+    be read, nothing of the follower after it, and of the leader after it what `leader` says. From
+    there all methods are simulated for the longest horizon:
+
+    - `constant_speed`, `constant_acceleration`: the driver goes on as at the origin;
+    - `default`: the model's default parameters;
+    - `population`: pooled parameters, calibrated on the drivers of the other folds;
+    - `fixed`: driver-specific parameters, calibrated on the driver's trajectory up to their first
+      origin: what every origin may read, and nothing after it;
+    - `population_residual`, `fixed_residual`: the same with a residual: they start with the
+      acceleration and the jerk at the origin, from which the model takes over within seconds
+      (`cfx.models.residual`);
+    - `policy`: observes all history up to each origin (`history` bounds it) and drives on from
+      there, seeing the simulated follower.
+
+    With `samples` there are also paths that are sampled from each origin (scores of them:
+    `cfx_forecasts.distributions`): of a stochastic policy (`learner.head=stochastic`), and
+    `population_ar`, `fixed_ar`, constant parameters with AR(1) noise on the acceleration, measured
+    on drivers of the other folds (with `run`, on all test drivers) or on the driver's own history,
+    before the first origin.
+
+    Errors of speed and position at each horizon are the RMSE over the origins of a driver, then the
+    mean over drivers, with a bootstrap interval over drivers: origins of one driver overlap and are
+    not independent. ADE and FDE are the mean absolute error of position over the way to a horizon,
+    and at it. A horizon counts the origins whose recording lasts that long.
+
+    The first origin is where the first part of the trajectory ends (`split`), or after
+    `min_history`. With a small `min_history` the table says too how errors depend on the length of
+    history; driver-specific parameters then come from that much.
+
+    Differences from the paper: it has no such experiment; it tests from one moment.
+    """
+
+    schema: ClassVar[type[Settings]] = ForecastSettings
+    settings: ForecastSettings
+    trial: ClassVar[Mapping[str, Any]] = {"folds": 3, "horizons": (0.5, 1.0), "histories": ()}
+
+    def run(self, context: ProtocolContext) -> ProtocolResult:
+        self._check(context)
+        trained = self.trained(context)
+        test = trained.test
+        evaluation = test.evaluation(self.settings.histories, fold=trained.fold)
+        tables = self._forecasts(test)
+        values = [in_text(evaluation.values), forecast_values(tables["forecasts"])]
+        return ProtocolResult(
+            replace(
+                evaluation,
+                values=pd.concat(values, ignore_index=True),
+                tables={**evaluation.tables, **tables},
+            ),
+            trained.policy_after(evaluation),
+            trained.curves,
+            trained.labels,
+            {**trained.notes, "forecasts": self._described(tables["forecasts"])},
+            calibration=trained.calibration,
+        )
+
+    def _check(self, context: ProtocolContext) -> None:
+        """Checks settings in seconds against the time step.
+
+        Raises:
+            ConfigError: one of them is no whole number of steps.
+        """
+        dt = context.simulator.dt
+        named = [("stride", self.settings.stride)]
+        named += [("horizons", horizon) for horizon in self.settings.horizons]
+        if self.settings.min_history is not None:
+            named.append(("min_history", self.settings.min_history))
+        for name, seconds in named:
+            steps = seconds / dt
+            if round(steps) < 1 or abs(steps - round(steps)) > 1e-3:
+                raise ConfigError(
+                    f"protocol.{name}: {seconds:g} s is no whole number of steps of {dt:g} s; give"
+                    f" a multiple of {dt:g}"
+                )
+
+    def _forecasts(self, test: HeldOut) -> dict[str, pd.DataFrame]:
+        """Forecasts the test drivers by all methods; returns the tables of it by name.
+
+        Raises:
+            DataError: no trajectory is long enough for a single forecast.
+        """
+        s, batch = self.settings, test.batch
+        dt = batch.dt
+        test = self._from_history(test)
+        shortest = round(s.horizons[0] / dt)
+        origins = Origins.every(round(s.stride / dt), test.first, batch.lengths - 1 - shortest)
+        if len(origins) == 0:
+            raise DataError(
+                "no trajectory goes on for protocol.horizons after its first origin; lower"
+                " protocol.min_history, split or protocol.horizons, or use longer trajectories"
+            )
+        steps = round(s.horizons[-1] / dt)
+        measured, recorded = measured_paths(batch, origins, steps)
+        self._say_who_is_forecast(test, origins)
+        paths = self._paths(test, origins, steps)
+        about = (test.pairs, origins)
+        table = forecast_errors(*about, paths, measured, recorded, s.horizons, dt)
+        tables = {"forecasts": table}
+        if s.samples > 0:
+            happened = Recorded.of(batch, origins, measured, recorded.cpu())
+            paths |= self._sampled(test, origins, steps)
+            tables["distributions"] = score_distributions(*about, paths, happened, s.horizons, dt)
+        return tables
+
+    def _described(self, table: pd.DataFrame) -> dict[str, Any]:
+        """Returns what `data.json` says of the forecasts."""
+        of_one = table[table["method"] == table["method"].iloc[0]]
+        counts = of_one.groupby("horizon_s").size()
+        return {
+            "leader": self.settings.leader,
+            "horizons_s": list(self.settings.horizons),
+            "origins": {f"{horizon:g}": int(count) for horizon, count in counts.items()},
+            "history_s": [float(of_one["history_s"].min()), float(of_one["history_s"].max())],
+        }
+
+    def _say_who_is_forecast(self, test: HeldOut, origins: Origins) -> None:
+        """Logs how many drivers there are forecasts of, and horizons that few or none reach."""
+        drivers = np.asarray(test.drivers, dtype=object)
+        left = test.batch.lengths[origins.pair] - 1 - origins.frame
+        known = len(set(drivers))
+        counts = {}
+        for horizon in self.settings.horizons:
+            reached = left >= round(horizon / test.batch.dt)
+            counts[horizon] = len(set(drivers[origins.pair[reached].cpu().numpy()]))
+        log.info(
+            "Forecasts from %d origins of %d drivers",
+            len(origins),
+            counts[self.settings.horizons[0]],
+        )
+        short = [f"{horizon:g} s ({count})" for horizon, count in counts.items() if count < known]
+        if short:
+            log.info(
+                "The recordings of some of the %d drivers end before these horizons (drivers that"
+                " count): %s. A smaller split or protocol.min_history leaves more to forecast",
+                known,
+                ", ".join(short),
+            )
+
+    def _from_history(self, test: HeldOut) -> HeldOut:
+        """Returns the test with driver-specific parameters of the history before first origins."""
+        seconds = self.settings.min_history
+        if seconds is None:
+            return test
+        context = test.context
+        first = torch.full_like(test.first, round(seconds / test.batch.dt))
+        first = torch.minimum(first, test.batch.lengths - 2)
+        fixed = context.calibrator.fixed(test.pairs, test.batch, first.cpu())
+        base = test.base
+        if base is not None:
+            base = test.policy.base_of(fixed)
+        return replace(test, first=first, fixed=fixed, base=base)
+
+    def _paths(self, test: HeldOut, origins: Origins, steps: int) -> dict[str, Paths]:
+        """Returns the paths of all methods."""
+        batch, context = test.batch, test.context
+        paths = {
+            "constant_speed": kinematic_paths(batch, origins, steps, accelerates=False),
+            "constant_acceleration": kinematic_paths(batch, origins, steps, accelerates=True),
+        }
+        each = torch.arange(len(batch), device=origins.pair.device)
+        agents = {}
+        for name, agent in test.methods_without_history().items():
+            agents[name] = (agent, test.network)
+        agents["fixed"] = (context.constant(FixedPolicy(), test.fixed), each)
+        residual = {"fixed_residual": (test.fixed, each)}
+        if test.population is not None:
+            residual["population_residual"] = (test.population, test.network)
+        for name, (parameters, network) in residual.items():
+            agent = context.constant(FixedPolicy(residual=True), parameters)
+            if can_drive(context.simulator, agent):
+                agents[name] = (agent, network)
+        for name, (agent, network) in agents.items():
+            found = self._from_origins(test, agent, origins, steps, network, (None,))
+            paths[name] = Paths(found.speed[0], found.travelled[0])
+        return paths
+
+    def _sampled(self, test: HeldOut, origins: Origins, steps: int) -> dict[str, Paths]:
+        """Returns sampled paths `(S, Q, K + 1)` of the methods that leave something to chance."""
+        context, each = test.context, torch.arange(len(test.batch), device=origins.pair.device)
+        agents = {}
+        for name, parameters in _constants(test).items():
+            noise = residual_noise(test, parameters, own=name == "fixed")
+            agent = constant_with_noise(context, parameters, *noise)
+            if can_drive(context.simulator, agent):
+                agents[f"{name}_ar"] = (agent, each)
+        if test.policy.is_stochastic:
+            agents["policy"] = (test.policy, test.network)
+        paths = {}
+        for name, (agent, network) in agents.items():
+            generators = []
+            for number in range(self.settings.samples):
+                seed = context.seed * 1_000_003 + number
+                generators.append(torch.Generator().manual_seed(seed))
+            log.info("Sampling %d paths of %s", len(generators), name)
+            paths[name] = self._from_origins(test, agent, origins, steps, network, generators)
+        return paths
+
+    def _from_origins(
+        self,
+        test: HeldOut,
+        agent: Agent,
+        origins: Origins,
+        steps: int,
+        network: Tensor,
+        generators: Sequence[torch.Generator | None],
+    ) -> Paths:
+        """Returns paths `(S, Q, K + 1)` of an agent."""
+        base: Tensor | None = test.unseen_base if test.base is None else test.base
+        if agent is not test.policy:
+            base = None  # it has a base for each driver, or needs none
+        return sample_from_origins(
+            test.context.simulator,
+            agent,
+            Followers(test.batch, network, base, test.policy.context_rule.history_s),
+            origins,
+            steps,
+            generators,
+            leader=self.settings.leader,
+        )
+
+
+def _constants(test: HeldOut) -> dict[str, Tensor]:
+    """Returns constant parameters of each test driver, `(P, n)`, that a residual can go with."""
+    if test.context.simulator.model.needs_simulator:
+        return {}
+    found = {"fixed": test.fixed}
+    if test.population is not None:
+        found["population"] = test.population[test.network]
+    return found

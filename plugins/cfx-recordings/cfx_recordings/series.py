@@ -1,0 +1,172 @@
+"""Pairs that a source gives as series over time: what follows from speeds and gaps, the cuts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from cfx.data.files import Floats, Ints
+from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.tracks import (
+    SINGLE_FRAME,
+    Marks,
+    accelerations,
+    counted,
+    driven,
+    first_of,
+    runs,
+    summed,
+    unique_name,
+)
+
+
+@dataclass(frozen=True)
+class Series:
+    """One follower behind one leader, as a source gives them; missing values are NaN.
+
+    Shapes: T frames; every array is `(T,)`, in SI units.
+
+    Attributes:
+        name: of the pair; each stretch that is cut out of it ends with -run2 and so on.
+        dt: time step, s.
+        frame: numbers of the frames, ascending; where one is missing, the pair is cut.
+        signals: any of a pair's signals; both speeds at least.
+        gap: bumper to bumper, m; None: both positions are given.
+        leader_length: m; 0 where positions are rear bumpers' or unknown.
+        labels: where any of these changes, the pair is cut; for instance who drives.
+        site, vehicle: as of pairs.
+        driver_types: what the values of `labels["driver_type"]` stand for; a single one without it.
+    """
+
+    name: str
+    recording: str
+    leader_id: str
+    follower_id: str
+    dt: float
+    frame: Ints
+    signals: Mapping[str, Floats]
+    gap: Floats | None = None
+    leader_length: float = 0.0
+    labels: Mapping[str, Ints] = field(default_factory=dict)
+    driver_types: Sequence[str] = ("",)
+    leader_driver_type: str = ""
+    site: str = ""
+    vehicle: str = ""
+
+
+def pairs_of(
+    series: Sequence[Series],
+    source: str,
+    *,
+    dropped: Sequence[Dropped] = (),
+    max_gap: float | None = None,
+) -> PairSet:
+    """Cuts series into pairs of consecutive frames without missing or impossible values.
+
+    A frame is left out, counted and ends the pair where a value is missing, a speed is negative,
+    or the gap is 0 or less, or more than `max_gap`.
+
+    Args:
+        max_gap: m; None: leaders may be anywhere ahead.
+    """
+    pairs: list[Pair] = []
+    lost = list(dropped)
+    ends: list[Dropped] = []
+    seen: dict[str, int] = {}
+    for one in series:
+        reasons = _left_out(one, max_gap)
+        is_good = ~np.any(list(reasons.values()), axis=0)
+        good = np.flatnonzero(is_good)
+        labels = [values[good] for values in one.labels.values()]
+        starts, sizes = runs(one.frame[good] - np.arange(len(good)), *labels)
+        is_pair = sizes > 1
+        lost += counted({**reasons, SINGLE_FRAME: sizes < 2}, "rows")
+        stops = starts + sizes
+        ends += counted(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
+        for start, stop in zip(starts[is_pair].tolist(), stops[is_pair].tolist(), strict=True):
+            pairs.append(_pair(one, slice(good[start], good[stop - 1] + 1), seen))
+    return PairSet(tuple(pairs), source, summed(lost), summed(ends))
+
+
+def _left_out(one: Series, max_gap: float | None) -> dict[str, Marks]:
+    """Returns the frames that belong to no pair, by the first reason that holds."""
+    values = list(one.signals.values())
+    if one.gap is None:
+        signals = one.signals
+        gap = signals["leader_position"] - one.leader_length - signals["follower_position"]
+    else:
+        gap = one.gap
+        values.append(gap)
+    slowest = np.minimum(one.signals["leader_speed"], one.signals["follower_speed"])
+    furthest = np.inf
+    if max_gap is not None:
+        furthest = max_gap
+    reasons: dict[str, Marks] = {
+        "a value is missing": np.isnan(np.sum(values, axis=0)),
+        "a speed is negative": slowest < 0,
+        "the leader is behind its follower (gap of 0 or less)": gap <= 0,
+        f"the leader is farther than {furthest:g} m": gap > furthest,
+    }
+    return first_of(reasons)
+
+
+def _ends(one: Series, reasons: Mapping[str, Marks], last: Ints) -> dict[str, Marks]:
+    """Returns why each pair ends, by reason.
+
+    Args:
+        last: index of each pair's last frame.
+    """
+    after = np.minimum(last + 1, len(one.frame) - 1)
+    found: dict[str, Marks] = {"the source's pair ends": last + 1 == len(one.frame)}
+    found["frames are missing"] = one.frame[after] != one.frame[last] + 1
+    for reason, holds in reasons.items():
+        found[reason] = holds[after]
+    for label, values in one.labels.items():
+        found[f"the {label.replace('_', ' ')} changes"] = values[after] != values[last]
+    return first_of(found)
+
+
+def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
+    """Returns the pair of a stretch of good frames."""
+    signals: dict[str, Any] = {}
+    for name, values in one.signals.items():
+        signals[name] = values[run]
+    if one.gap is not None:
+        leader = signals.get("leader_position")
+        if leader is None:
+            leader = driven(signals["leader_speed"], one.dt) + one.leader_length
+        signals["leader_position"] = leader
+        signals["follower_position"] = leader - one.leader_length - one.gap[run]
+    for who in ("leader", "follower"):
+        if f"{who}_acceleration" not in signals:
+            signals[f"{who}_acceleration"] = accelerations(signals[f"{who}_speed"], one.dt)
+    kind = 0
+    if "driver_type" in one.labels:
+        kind = int(one.labels["driver_type"][run.start])
+    lane = None
+    if "lane" in one.labels:
+        lane = int(one.labels["lane"][run.start])
+    return Pair(
+        pair_id=unique_name(one.name, seen),
+        recording=one.recording,
+        leader_id=one.leader_id,
+        follower_id=one.follower_id,
+        first_frame=int(one.frame[run.start]),
+        dt=one.dt,
+        leader_length=one.leader_length,
+        lane=lane,
+        driver_type=one.driver_types[kind],
+        leader_driver_type=one.leader_driver_type,
+        site=one.site,
+        vehicle=one.vehicle,
+        **signals,
+    )
+
+
+def frames_at(time: Floats, dt: float) -> Ints:
+    """Returns the frame number of each time, 0 at the first, `(T,)`."""
+    frames: Ints = np.rint((time - time[0]) / dt).astype(np.int64)
+    return frames

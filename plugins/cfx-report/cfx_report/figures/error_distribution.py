@@ -1,0 +1,73 @@
+"""How errors are distributed over pairs: cumulative, so that a few pairs can be read too."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from cfx.figures.canvas import (
+    DASHES,
+    HIDDEN,
+    canvas,
+    finite,
+    method_legend,
+    points,
+    side_by_side,
+    styled,
+)
+from cfx.figures.figure import JobFigure, Results
+from cfx.figures.text import colour_of
+
+_ERRORS = {"rmse_speed": "RMSE of speed (m/s)", "rmse_gap": "RMSE of gap (m)"}
+_FEWEST = 3
+"""Pairs from which on there is a distribution."""
+
+
+@styled
+def draw_error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> Figure:
+    """Draws the share of pairs whose error is at most so large, a line per method.
+
+    Args:
+        pairs: a row per pair and method: `method`, `rmse_speed`, `rmse_gap`.
+        methods: those to show.
+    """
+    figure = canvas(3.9)
+    for axes, (column, title) in zip(side_by_side(figure, (1, 1)), _ERRORS.items(), strict=True):
+        for method in methods:
+            own = pairs.loc[pairs["method"] == method, column]
+            errors = np.sort(finite(own.to_numpy(dtype=float)))
+            if len(errors):
+                axes.ecdf(
+                    errors,
+                    color=colour_of(method),
+                    linestyle=DASHES.get(method, "solid"),
+                    linewidth=points(1.6),
+                )
+        axes.set_xlim(left=0)
+        axes.set_xlabel(title)
+        axes.set_ylabel("share of pairs")
+        axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
+    method_legend(figure, methods)
+    return figure
+
+
+class ErrorDistribution(JobFigure):
+    """How the errors of each method are distributed over pairs."""
+
+    title = "Distribution of errors over pairs"
+    caption = (
+        "The share of pairs whose RMSE on the test part is at most so large, for each method: the"
+        " farther to the left a line, the closer the method is to the drivers."
+    )
+    order = 41
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where several pairs were driven by calibrated parameters or a policy."""
+        methods = [method for method in results.methods if method not in HIDDEN]
+        if results.pairs["pair_id"].nunique() < _FEWEST or set(methods) <= {"default"}:
+            return None
+        return draw_error_distribution(results.pairs, methods)

@@ -1,0 +1,80 @@
+"""Gap against relative speed: how closely a simulated driver circles as the real one does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from matplotlib.figure import Figure
+
+from cfx.evaluation.result import PairTrajectory
+from cfx.figures.canvas import (
+    DASHES,
+    HIDDEN,
+    canvas,
+    method_legend,
+    most_across,
+    points,
+    styled,
+)
+from cfx.figures.figure import JobFigure, Results
+from cfx.figures.text import EDGE, colour_of, short
+from cfx.figures.trajectories import chosen_pairs
+
+_PAIRS = 3
+
+
+@styled
+def draw_following(trajectories: Sequence[PairTrajectory], methods: Sequence[str]) -> Figure:
+    """Draws the gap of some pairs against the leader's speed less the follower's.
+
+    Args:
+        trajectories: test parts; a panel each.
+        methods: those to show, beside the real driver.
+    """
+    across = min(most_across(_PAIRS), len(trajectories))
+    rows = -(-len(trajectories) // across)
+    figure = canvas(0.7 + 3.2 * rows)
+    grid = figure.subplots(rows, across, squeeze=False)
+    for axes, trajectory in zip(grid.flat, trajectories, strict=False):
+        speeds = {"real": trajectory.real_speed, **trajectory.speed}
+        gaps = {"real": trajectory.real_gap, **trajectory.gap}
+        for method in ("real", *methods):
+            axes.plot(
+                trajectory.leader_speed - speeds[method],
+                gaps[method],
+                color=colour_of(method),
+                linestyle=DASHES.get(method, "solid"),
+                linewidth=points(1.4),
+            )
+        axes.axvline(0, color=EDGE, linewidth=points(0.9))
+        axes.set_title(short(trajectory.pair_id))
+        axes.set_xlabel("relative speed (m/s)")
+    for row in grid:
+        row[0].set_ylabel("gap (m)")
+    for unused in grid.flat[len(trajectories) :]:
+        unused.set_visible(False)
+    method_legend(figure, ["real", *methods])
+    return figure
+
+
+class Following(JobFigure):
+    """Gap against relative speed, of the real driver and of each method."""
+
+    title = "Gap against relative speed"
+    caption = (
+        "The gap against the leader's speed less the follower's over the test part, of the best,"
+        " the median and the worst pair. Drivers circle around the gap that they want: to the right"
+        " of 0 the gap grows."
+    )
+    order = 31
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where trajectories are known."""
+        if not len(results.trajectories):
+            return None
+        methods = []
+        for method in results.methods:
+            if method in results.trajectories[0].speed and method not in HIDDEN:
+                methods.append(method)
+        pairs = [trajectory for _, trajectory in chosen_pairs(results, None, _PAIRS)]
+        return draw_following(pairs, methods)

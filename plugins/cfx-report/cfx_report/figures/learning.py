@@ -1,0 +1,128 @@
+"""How the networks of a job learned."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
+
+from cfx.figures.canvas import Array, canvas, legend_above, plain_tick, say, styled
+from cfx.figures.figure import JobFigure, Results
+from cfx.figures.text import EDGE, TRAIN_COLOUR, VALIDATION_COLOUR
+from cfx.learners.curves import first_sampled_epoch, over_networks
+
+LOSS_TITLE = "loss (as the learner defines it)"
+SAMPLED = "training counts sampled paths, too (CRPS)"
+"""What the training loss has from the first sampled epoch on."""
+
+_COLUMNS = {
+    "train_loss": ("training", TRAIN_COLOUR, "solid"),
+    "validation_loss": ("validation", VALIDATION_COLOUR, (0, (5.0, 1.8))),
+}
+_MOST_POINTS = 250
+_LOGARITHMIC_FROM = 5.0
+
+
+def loss_quartiles(curves: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return quartiles over the networks of each loss that was measured.
+
+    Args:
+        curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; NaN where not measured.
+
+    Returns:
+        By column of `curves`; a row per epoch, columns 0.25, 0.5 and 0.75.
+    """
+    found = {}
+    for column in _COLUMNS:
+        losses = over_networks(curves, column)
+        if not losses.empty:
+            count = min(_MOST_POINTS, len(losses))
+            kept = np.unique(np.linspace(0, len(losses) - 1, count).round().astype(int))
+            found[column] = losses.iloc[kept].quantile((0.25, 0.5, 0.75), axis=1).T
+    return found
+
+
+def _logarithmic_ticks(values: Array) -> list[float]:
+    """Return ticks where all losses are positive and span more than a factor of five."""
+    if not len(values):
+        return []
+    low, high = float(values.min()), float(values.max())
+    if not (low > 0 and high > _LOGARITHMIC_FROM * low):
+        return []
+    digits = (1, 2, 5) if high < 1e3 * low else (1,)
+    ticks = []
+    for power in range(int(np.floor(np.log10(low))), int(np.ceil(np.log10(high))) + 1):
+        for digit in digits:
+            ticks.append(digit * 10.0**power)
+    return ticks
+
+
+@styled
+def draw_learning(curves: pd.DataFrame) -> Figure:
+    """Draw training and validation loss per epoch: median over the networks, and quartiles.
+
+    Args:
+        curves: as for `loss_quartiles`; `sampled_paths` where a head draws.
+    """
+    figure = canvas(3.9)
+    axes = figure.subplots()
+    networks = int(curves["network"].nunique())
+    losses = loss_quartiles(curves)
+    for column, quartiles in losses.items():
+        label, colour, dash = _COLUMNS[column]
+        epochs = quartiles.index.to_numpy(dtype=float)
+        axes.plot(
+            epochs,
+            quartiles[0.5],
+            color=colour,
+            linestyle=dash,
+            linewidth=2.0,
+            marker="o" if len(epochs) < 3 else None,
+            label=label,
+            zorder=3,
+        )
+        if networks > 1:
+            low, high = quartiles[0.25], quartiles[0.75]
+            axes.fill_between(epochs, low, high, color=colour, alpha=0.25, linewidth=0)
+    sampled_from = first_sampled_epoch(curves)
+    if sampled_from is not None:
+        dash = (0, (4, 2))
+        axes.axvline(sampled_from, color=EDGE, linewidth=0.9, linestyle=dash, label=SAMPLED)
+    ends = [one[[0.25, 0.75]].to_numpy(dtype=float).ravel() for one in losses.values()]
+    ticks = _logarithmic_ticks(np.concatenate([np.empty(0), *ends]))
+    if ticks:
+        axes.set_yscale("log")
+        axes.yaxis.set_major_locator(FixedLocator(ticks))
+        axes.yaxis.set_major_formatter(FuncFormatter(plain_tick))
+        axes.yaxis.set_minor_formatter(NullFormatter())
+    axes.xaxis.set_major_locator(MaxNLocator(integer=True))
+    axes.set_xlabel("epoch")
+    axes.set_ylabel(LOSS_TITLE)
+    axes.margins(x=0.01)
+    if not losses:
+        say(axes, "no loss was measured")
+    elif len(next(iter(losses.values()))) == 1:
+        axes.set_xticks([int(curves["epoch"].iloc[0])])
+    title = f"{networks} networks: median and quartiles" if networks > 1 else "one network"
+    legend_above(figure, title=title)
+    return figure
+
+
+class LearningCurve(JobFigure):
+    """Training and validation loss by epoch."""
+
+    title = "Learning curves"
+    caption = (
+        "Loss by epoch as the learner defines it: the median over the networks and, where there"
+        " are several, the band between the quartiles. A network that stopped early keeps its last"
+        " loss."
+    )
+    order = 80
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where something was learned."""
+        table = results.tables.get("curves")
+        if table is None or not len(table):
+            return None
+        return draw_learning(table)

@@ -1,0 +1,50 @@
+"""Model against model: each pair's error of the closest job, against that of others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from cfx.evaluation.comparison import Against
+from cfx.figures.canvas import canvas, draw_points, most_across, points, styled, wrapped
+from cfx.figures.text import EDGE, JOB_COLOURS, percent
+
+_ACROSS = 3
+_MOST = 6
+"""Others that are shown; the next best come first."""
+
+
+@styled
+def draw_models(errors: Mapping[str, pd.DataFrame], compared: Sequence[Against]) -> Figure:
+    """Draws a panel per other job: a dot per pair; above the line the best job is closer.
+
+    Args:
+        errors: as `cfx.evaluation.comparison.against_the_best` takes them.
+        compared: as it returns them; at least one.
+    """
+    shown = compared[:_MOST]
+    across = min(most_across(_ACROSS), len(shown))
+    rows = -(-len(shown) // across)
+    figure = canvas(0.4 + 3.3 * rows, 3.5 * across)
+    grid = figure.subplots(rows, across, squeeze=False)
+    for place, one in enumerate(shown):
+        axes = grid.flat[place]
+        both = errors[one.best].merge(
+            errors[one.other], on=["pair_id", "frames"], suffixes=("", "_other")
+        )
+        best, other = both["error"].to_numpy(float), both["error_other"].to_numpy(float)
+        end = 1.08 * float(np.nanmax(np.concatenate([best, other])))
+        axes.plot([0, end], [0, end], color=EDGE, linewidth=points(1), zorder=1)
+        draw_points(axes, best, other, "o", JOB_COLOURS[place], 4.5, alpha=0.65)
+        axes.set_xlim(0, end)
+        axes.set_ylim(0, end)
+        axes.set_aspect("equal")
+        axes.set_title(f"{percent(one.found.mean, 1)} (p = {one.p_value:.2g})")
+        axes.set_xlabel(wrapped(f"RMSE of speed of {one.best} (m/s)"))
+        axes.set_ylabel(wrapped(f"RMSE of speed of {one.other} (m/s)"))
+    for unused in grid.flat[len(shown) :]:
+        unused.set_visible(False)
+    return figure

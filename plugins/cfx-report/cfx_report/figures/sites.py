@@ -1,0 +1,103 @@
+"""Improvements by site: a row for each road or area, and one in which each counts once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
+
+from cfx.evaluation.sites import ALL
+from cfx.figures.canvas import canvas, hover, percent_tick
+from cfx.figures.figure import JobFigure, Results
+from cfx.figures.text import COLOURS, INK, label, percent
+
+_PANELS = (("test", "fixed"), ("full_trajectory", "population"))
+"""Which part of trajectories is compared with what, one panel each."""
+
+_WORST = -1.0
+"""Ends of intervals beyond this are cut."""
+
+
+def draw_sites(sites: pd.DataFrame) -> Figure | None:
+    """Draws the policy's mean improvement of each site, with its 95 % interval.
+
+    Args:
+        sites: as `cfx.evaluation.sites.site_table`.
+    """
+    panels = [
+        (scope, baseline)
+        for scope, baseline in _PANELS
+        if f"over_{baseline}" in sites
+        and sites.loc[sites["scope"] == scope, f"over_{baseline}"].notna().any()
+    ]
+    if not panels:
+        return None
+    names = list(dict.fromkeys(zip(sites["site"], sites["driver_type"], strict=True)))
+    figure = canvas(1.4 + 0.34 * len(names))
+    axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for panel, (scope, baseline) in zip(axes, panels, strict=True):
+        _panel(panel, sites[sites["scope"] == scope], baseline, names)
+        part = "last part" if scope == "test" else "full trajectories"
+        panel.set_title(f"{part}: over {label(baseline)}")
+    axes[0].set_yticks(range(len(names)), [_called(*name) for name in names])
+    axes[0].invert_yaxis()
+    for tick, (site, kind) in zip(axes[0].get_yticklabels(), names, strict=True):
+        tick.set_fontweight("bold" if kind == ALL and site == ALL else "normal")
+    return figure
+
+
+def _called(site: str, kind: str) -> str:
+    if kind != ALL:
+        return f"{kind}"
+    return "mean over sites" if site == ALL else site
+
+
+def _panel(axes: Axes, rows: pd.DataFrame, baseline: str, names: list[tuple[str, str]]) -> None:
+    places = {name: place for place, name in enumerate(names)}
+    for _, row in rows.iterrows():
+        value = float(row[f"over_{baseline}"])
+        if not np.isfinite(value):
+            continue
+        place = places[(row["site"], row["driver_type"])]
+        is_whole = row["driver_type"] == ALL
+        colour = COLOURS["policy"] if is_whole else "#9a9a9a"
+        ends = [float(row[f"over_{baseline}_{end}"]) for end in ("low", "high")]
+        if np.isfinite(ends).all():
+            axes.plot(np.clip(ends, _WORST, None), [place, place], color=colour, linewidth=2.0)
+        (point,) = axes.plot(
+            max(value, _WORST), place, "o", color=colour, markersize=7 if is_whole else 5
+        )
+        hover(point, f"{_called(row['site'], row['driver_type'])}: {percent(value, 1)}")
+        axes.annotate(
+            percent(value, 1),
+            (max(value, _WORST), place),
+            (0, 6),
+            textcoords="offset points",
+            ha="center",
+            va="bottom",
+            fontsize=8.5,
+            color=INK,
+        )
+    axes.axvline(0, color=INK, linewidth=0.9)
+    axes.set_xlabel("improvement of the RMSE of speed, 95 % interval")
+    axes.xaxis.set_major_formatter(FuncFormatter(percent_tick))
+    axes.set_ylim(-0.8, len(names) - 0.4)
+    axes.grid(visible=False, axis="y")
+
+
+class SiteImprovements(JobFigure):
+    """The policy's improvement at each site, people and automated cars apart."""
+
+    title = "Improvement by site"
+    caption = (
+        "Mean improvement of the policy at each road or area, with its 95 % interval over drivers;"
+        " in grey types of drivers there. In the mean over sites each counts once."
+    )
+    order = 15
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where several sites were tested."""
+        table = results.tables.get("sites")
+        return None if table is None else draw_sites(table)

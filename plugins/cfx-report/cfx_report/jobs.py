@@ -1,0 +1,56 @@
+"""Jobs that stand in one report."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from cfx.evaluation.metrics.base import MetricInfo
+from cfx.evaluation.result import Purpose
+from cfx.figures.job import Job
+from cfx.figures.text import TEST, pretty_unit
+
+
+@dataclass(frozen=True)
+class Unfinished:
+    """A job that cannot be reported: where it is, and why."""
+
+    place: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Runs:
+    """What was found: finished jobs, each with a name of its own, and the others."""
+
+    jobs: tuple[Job, ...]
+    unfinished: tuple[Unfinished, ...] = ()
+
+
+def of_purpose(jobs: Iterable[Job], *purposes: Purpose) -> list[Job]:
+    """Returns the jobs that have one of these purposes."""
+    return [job for job in jobs if job.purpose in purposes]
+
+
+def are_calibrations(jobs: Iterable[Job]) -> bool:
+    """Says whether none of the jobs has a policy that adapts: nothing is said of policies then."""
+    return all(job.purpose is Purpose.CALIBRATION for job in jobs)
+
+
+def any_baselines(jobs: Iterable[Job], scope: str = TEST) -> list[str]:
+    """Returns what the policy of any of the jobs is compared with, in the order of the jobs."""
+    found: dict[str, None] = {}
+    for job in jobs:
+        found |= dict.fromkeys(job.baselines(scope))
+    return list(found)
+
+
+def any_has_metric(jobs: Iterable[Job], name: str, method: str, scope: str = TEST) -> bool:
+    """Says whether any of the jobs has measured a metric."""
+    return any(job.has_metric(name, method, scope) for job in jobs)
+
+
+def metric_title(metric: MetricInfo) -> str:
+    """Returns a heading with the unit: "RMSE speed (m/s)"."""
+    heading = metric.heading[:1].upper() + metric.heading[1:]
+    return f"{heading} ({pretty_unit(metric.unit)})" if metric.unit else heading

@@ -1,0 +1,227 @@
+"""What tells the jobs of one report apart, and rows of jobs that one setting alone tells apart."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from cfx.core.errors import ConfigError
+from cfx.evaluation.result import Purpose
+from cfx.figures.job import Job
+from cfx.figures.text import common_prefix
+from cfx.results.provenance import flatten
+from cfx_report.jobs import any_baselines
+
+GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")
+_NO_DIFFERENCE = (
+    "tracking.",
+    "cache.",
+    "figures.",
+    "simulation.",
+    "simulator.compile",
+    "simulator.memory_mb",
+    "threads",
+    "device",
+    "preset",
+)
+"""Settings that change where or how fast a job runs, not what comes out."""
+
+SEPARATOR = " · "
+
+_MOST = 4
+"""Most parts of a name that are all shown; of more, those that tell the jobs apart are."""
+
+_LONG = 24
+"""Characters of a value from which on what all jobs' values begin with is left out."""
+
+
+def named(jobs: Sequence[Job]) -> tuple[Job, ...]:
+    """Gives every job a short name: its driving model, and what else differs between the jobs."""
+    columns = _columns(jobs, ())
+    if len(columns) > _MOST:
+        columns = _telling(columns)
+    names = _joined(columns)
+    renamed = []
+    for k, job in enumerate(jobs):
+        name = names[k]
+        if names.count(name) > 1:
+            name += f" ({names[: k + 1].count(name)})"
+        renamed.append(replace(job, name=name))
+    return tuple(renamed)
+
+
+def shortest_names(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[str]:
+    """Returns names of as few parts as tell apart what `differences` tells apart."""
+    return _joined(_telling(_columns(jobs, ignored)))
+
+
+def _joined(columns: Sequence[Sequence[str]]) -> list[str]:
+    """Returns a name for each job: its values in the columns, without the absent ones."""
+    names = []
+    for values in zip(*columns, strict=True):
+        names.append(SEPARATOR.join(value for value in values if value))
+    return names
+
+
+def _telling(columns: Sequence[list[str]]) -> list[list[str]]:
+    """Returns the first column, and as few others as tell apart what all columns tell apart."""
+    left, kept = list(range(1, len(columns))), [0]
+    while left and _kinds(columns, kept) < _kinds(columns, range(len(columns))):
+        best = max(left, key=lambda one: _kinds(columns, [*kept, one]))
+        left.remove(best)
+        kept.append(best)
+    return [columns[one] for one in sorted(kept)]
+
+
+def _kinds(columns: Sequence[Sequence[str]], chosen: Sequence[int]) -> int:
+    """Returns how many jobs some columns tell apart."""
+    return len(set(zip(*(columns[one] for one in chosen), strict=True)))
+
+
+def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[str]]:
+    """Returns for every job its driving model and every other component and setting that differs.
+
+    A setting of a component counts only between jobs that share the component: that of another one
+    is another setting.
+
+    Args:
+        jobs: that are compared.
+        ignored: full names of settings that do not count.
+    """
+    parts = []
+    for values in zip(*_columns(jobs, ignored), strict=True):
+        parts.append([value for value in values if value])
+    return parts
+
+
+def _columns(jobs: Sequence[Job], ignored: Sequence[str]) -> list[list[str]]:
+    """Returns the models, and a column for everything else that differs; "" where it is absent."""
+    columns = [[job.component("model") or "model" for job in jobs]]
+    for group in GROUPS[1:]:
+        columns.append([job.component(group) for job in jobs])
+    flat = [flatten(dict(job.config)) for job in jobs]
+    keys: dict[str, None] = {}
+    for values in flat:
+        keys |= dict.fromkeys(values)
+    for key in keys:
+        counts = key not in ignored and not key.startswith(_NO_DIFFERENCE)
+        if counts and not key.endswith(".name") and _differs(key, jobs, flat):
+            columns.append(_said(key, flat))
+    first, *others = columns
+    return [first, *(column for column in others if len(set(column)) > 1)]
+
+
+def _differs(key: str, jobs: Sequence[Job], flat: Sequence[Mapping[str, Any]]) -> bool:
+    """Says whether a setting differs between jobs that share the component it belongs to."""
+    group = key.partition(".")[0]
+    found: dict[str, set[Any]] = {}
+    for job, values in zip(jobs, flat, strict=True):
+        peer = job.component(group) if group in GROUPS else ""
+        found.setdefault(peer, set()).add(values.get(key, ""))
+    return any(len(values) > 1 for values in found.values())
+
+
+def _said(key: str, flat: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Returns a setting of each job in words; long values without what they all begin with."""
+    values = [str(one[key]) if key in one else "" for one in flat]
+    longest = max(map(len, values))
+    same = common_prefix([value for value in values if value])
+    said = []
+    if longest > _LONG and same:
+        values = [value and f"…{value.removeprefix(same)}" for value in values]
+    for value in values:
+        if not value or key == "style.cluster":
+            said.append(value)
+        elif key == "seed":
+            said.append(f"seed {value}")
+        else:
+            said.append(f"{key.partition('.')[2] or key}={value}")
+    return said
+
+
+@dataclass(frozen=True)
+class Row:
+    """Jobs that a row sums up: one, or several that differ in one setting.
+
+    Attributes:
+        name: what tells the row from the others.
+        jobs: at least one.
+    """
+
+    name: str
+    jobs: tuple[Job, ...]
+
+    def values(self, name: str, method: str) -> np.ndarray:
+        """Returns a metric of a method in each job, `(jobs,)`."""
+        return np.array([job.metric(name, method) for job in self.jobs])
+
+    def improvements(self, statistic: str, baseline: str) -> np.ndarray:
+        """Returns a statistic of the policy's improvement in each job, `(jobs,)`, a fraction.
+
+        NaN for jobs that do not compare their policy with the baseline.
+        """
+        values = np.full(len(self.jobs), np.nan)
+        for place, job in enumerate(self.jobs):
+            if baseline in job.baselines():
+                values[place] = job.improvement(statistic, baseline)
+        return values
+
+
+def rows_of(jobs: Sequence[Job], group_by: str | None = None) -> tuple[Row, ...]:
+    """Returns the rows of a table, in the order of the jobs.
+
+    Raises:
+        ConfigError: no job has the setting `group_by`.
+    """
+    ignored = () if group_by is None else (group_by,)
+    if group_by is not None and not any(group_by in flatten(dict(job.config)) for job in jobs):
+        raise ConfigError(
+            f"--group-by {group_by}: no job has this setting; name one as config.yaml does, for"
+            " instance seed or data.max_pairs"
+        )
+    names = shortest_names(jobs, ignored)
+    found: dict[str, list[Job]] = {}
+    for number, (name, job) in enumerate(zip(names, jobs, strict=True)):
+        key = name if group_by is not None or names.count(name) == 1 else f"{name} ({number + 1})"
+        found.setdefault(key, []).append(job)
+    return tuple(Row(name, tuple(alike)) for name, alike in found.items())
+
+
+def rows_over_seeds(jobs: Sequence[Job]) -> tuple[Row, ...]:
+    """Returns the jobs in rows, those that differ in the seed alone together."""
+    if len({job.setting("seed") for job in jobs}) < 2:
+        return rows_of(jobs)
+    return rows_of(jobs, "seed")
+
+
+def methods_of(rows: Sequence[Row]) -> list[str]:
+    """Returns the methods that any job measured; a calibration's policy is no method of its own."""
+    found: dict[str, None] = {}
+    for row in rows:
+        for job in row.jobs:
+            found |= dict.fromkeys(job.meaningful_methods)
+    found.pop("policy", None)
+    if any_adapts(rows):
+        return [*found, "policy"]
+    return [method for method in found if method != "fixed"] + ["fixed"]
+
+
+def any_adapts(rows: Sequence[Row]) -> bool:
+    """Says whether any job has a policy that adapts; without one they are calibrations."""
+    for row in rows:
+        for job in row.jobs:
+            if job.purpose is not Purpose.CALIBRATION:
+                return True
+    return False
+
+
+def baselines_of(rows: Sequence[Row]) -> list[str]:
+    """Returns the calibrations that any job compares its policy with."""
+    jobs: list[Job] = []
+    for row in rows:
+        jobs += row.jobs
+    found = any_baselines(jobs)
+    return [baseline for baseline in found if baseline in {"fixed", "population"}]

@@ -1,0 +1,294 @@
+"""The page: one HTML file with its summary, plots, tables, scripts and styles in it."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+from collections.abc import Sequence
+from datetime import datetime
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from cfx.core.files import write_output
+from cfx.core.registry import installed
+from cfx.data.style import CLUSTERS
+from cfx.evaluation.headline import Comparison, contradiction
+from cfx.evaluation.result import Purpose
+from cfx.figures.figure import draw, figure_named
+from cfx.figures.job import Job
+from cfx.figures.text import (
+    CLUSTER_COLOURS,
+    COLOURS,
+    TEST,
+    explained,
+    few_drivers,
+    percent,
+    plural,
+    short_label,
+)
+from cfx.figures.write import inline_scripts, security_policy
+from cfx_report.jobs import Runs, of_purpose
+from cfx_report.names import Row, rows_over_seeds
+from cfx_report.section import MOST, Section, View, lacking
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+
+
+_ASSETS = resources.files("cfx_report") / "assets"
+_SCRIPTS = ("sortable/sortable.min.js", "sortable/sortable.a11y.min.js", "page.js")
+
+
+def write_report(runs: Runs, output: Path, title: str | None = None) -> Path:
+    """Writes the page about some jobs; returns its path.
+
+    Args:
+        runs: at least one finished job.
+        output: the file; what was there is replaced once the new page is complete.
+        title: of the page; None for one that names the driving models.
+
+    Raises:
+        OutputError: the page cannot be written.
+    """
+    write_output(output, render(runs, title), "the report")
+    return output
+
+
+def render(runs: Runs, title: str | None = None) -> str:
+    """Returns the page about some jobs as HTML."""
+    from markupsafe import Markup
+
+    environment = _environment(runs)
+    sections = []
+    for one in installed("section"):
+        body = one.attempt(lambda section: _section(environment, section, runs), "")
+        if body.strip():
+            sections.append((one.name, one.part, Markup(body)))  # noqa: S704 - a template's
+    scripts = inline_scripts([_asset(name) for name in _SCRIPTS])
+    return environment.get_template("page.html.j2").render(
+        title=title or _title(runs.jobs),
+        written=f"{datetime.now():%d %B %Y}".lstrip("0"),
+        # Nothing of a job's data is in them.
+        scripts=[Markup(script) for script in scripts],  # noqa: S704
+        security=security_policy(scripts),
+        style=_asset("page.css") + _colours(),
+        summary=summary(runs.jobs),
+        jobs=len(runs.jobs),
+        sections=sections,
+    )
+
+
+def _environment(runs: Runs) -> Environment:
+    """Returns what templates are drawn with: the functions that `Section` lists."""
+    import jinja2
+
+    environment = jinja2.Environment(
+        autoescape=True,
+        undefined=jinja2.StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        loader=jinja2.FunctionLoader(_asset),
+    )
+    environment.filters["placed"] = _placed
+
+    environment.globals |= {
+        "drawn": functools.partial(_drawn, environment),
+        "caption": lambda name: figure_named(name).part.caption,
+        "lacking": lambda file, what: lacking(runs.jobs, file, what),
+        "most": MOST,
+        "next_number": itertools.count(1).__next__,
+    }
+    blocks = environment.get_template("blocks.html.j2").module
+    for name in ("figure", "table", "fold", "drawn_folds", "cards", "missing"):
+        environment.globals[name] = getattr(blocks, name)
+    return environment
+
+
+def _drawn(environment: Environment, name: str, job: Job) -> Any:
+    """Returns the figure of a name as the job has written it; "" if the job lacks its data."""
+    found = figure_named(name)
+    drawing = draw(found, job.results)
+    if drawing is None:
+        return ""
+    figure: Any = environment.globals["figure"]
+    return figure({"": View(drawing)}, found.part.title)
+
+
+def _section(environment: Environment, section: Section, runs: Runs) -> str:
+    context = section.context(runs)
+    if context is None:
+        return ""
+    template = environment.from_string(section.template)
+    return template.render(runs=runs, section=section, **context)
+
+
+def _title(jobs: Sequence[Job]) -> str:
+    """Returns a title that names the driving models."""
+    subject = (
+        "Calibration"
+        if len(of_purpose(jobs, Purpose.CALIBRATION)) == len(jobs)
+        else "Parameters that adapt"
+    )
+    *others, last = dict.fromkeys(job.component("model") for job in jobs)
+    models = f"{', '.join(others)} and {last}" if others else last
+    return f"{subject}: {models}"
+
+
+def _asset(name: str) -> str:
+    return (_ASSETS / name).read_text(encoding="utf-8")
+
+
+def _placed(svg: str, place: str) -> Any:
+    """Returns an `svg` element with ids of its own, at a place of the page."""
+    from markupsafe import Markup
+
+    from cfx.figures.write import PLACE
+
+    return Markup(svg.replace(PLACE, f"{place}-"))  # noqa: S704 - Matplotlib escapes all texts
+
+
+def _colours() -> str:
+    """Returns the style rules for the dots of methods and clusters."""
+    rules = ""
+    for name, colour in [*COLOURS.items(), *zip(CLUSTERS, CLUSTER_COLOURS, strict=True)]:
+        rules += f'\n[data-colour="{name}"]::before {{ background: {colour}; }}'
+    return rules
+
+
+_MOST = 3
+"""Up to so many jobs have a sentence each."""
+
+
+def summary(jobs: Sequence[Job]) -> list[str]:
+    """Returns sentences: against driver-specific calibration, and against pooled calibration."""
+    first = (
+        f"{_amount(jobs)}: is a policy that adapts the parameters closer to the real driver than"
+        f" {explained('fixed')}?"
+    )
+    compared = of_purpose(jobs, Purpose.ADAPTATION)
+    warnings = _few(compared)
+    references = [_reference(job) for job in of_purpose(jobs, Purpose.POLICY)]
+    constant = of_purpose(jobs, Purpose.CALIBRATION)
+    if not compared and not references:
+        first = f"{_amount(jobs)}: how close does the driving model come with constant parameters?"
+    if len(constant) <= _MOST:
+        references += [_calibration(job) for job in constant]
+    else:
+        references.append(f"{len(constant)} jobs are calibrations, without adaptation.")
+    if len(compared) <= _MOST:
+        return [first, *map(_verdict, compared), *warnings, *references]
+    counts = f"{_counts(compared)} (by the 95 % interval of the mean improvement)."
+    return [first, counts, _best(jobs), *warnings, *references]
+
+
+def _few(jobs: Sequence[Job]) -> list[str]:
+    """Returns a warning if any of the jobs compares its policy on few drivers."""
+    if not jobs:
+        return []
+    fewest = min(job.pairs["driver"].nunique() for job in jobs)
+    warning = few_drivers(fewest)
+    return [warning] if warning else []
+
+
+def _counts(jobs: Sequence[Job]) -> str:
+    """Returns in how many jobs the policy is closer, over each of two baselines."""
+    said = []
+    for baseline, against in (
+        ("fixed", f"Of {len(jobs)} jobs"),
+        ("population", "against pooled calibration"),
+    ):
+        sides = [_side(job, baseline) for job in jobs if baseline in job.baselines()]
+        if sides:
+            counts = ", ".join(
+                f"{side} in {sides.count(side)}" for side in ("yes", "no", "undecided")
+            )
+            said.append(f"{against}: {counts}")
+    return "; ".join(said)
+
+
+def _best(jobs: Sequence[Job]) -> str:
+    """Says which job improves most, or which jobs over their seeds: no lucky seed is picked."""
+    rows = [row for row in rows_over_seeds(jobs) if of_purpose(row.jobs, Purpose.ADAPTATION)]
+    best = max(rows, key=_mean_for_ranking)
+    if len(best.jobs) == 1:
+        return f"The best mean: {_verdict(best.jobs[0])}"
+    gains = best.improvements("mean", "fixed")
+    least, most = (percent(float(end), 1) for end in (np.nanmin(gains), np.nanmax(gains)))
+    return (
+        f"The best mean over seeds: {best.name}. Improvement of the RMSE of speed:"
+        f" {percent(float(np.nanmean(gains)), 1)} on average ({least} to {most} in"
+        f" {len(best.jobs)} seeds)."
+    )
+
+
+def _mean_for_ranking(row: Row) -> float:
+    means = row.improvements("mean", "fixed")
+    known = means[np.isfinite(means)]
+    return float(known.mean()) if len(known) else -np.inf
+
+
+def _reference(job: Job) -> str:
+    """Says what a policy reaches that sets the acceleration itself."""
+    speed, gap = job.metric("rmse_speed", "policy"), job.metric("rmse_gap", "policy")
+    return (
+        f"{job.name}: the policy sets the acceleration itself. RMSE of speed {speed:.3f} m/s, of"
+        f" gap {gap:.2f} m: an upper reference for the models that follow."
+    )
+
+
+def _calibration(job: Job) -> str:
+    """Says how close constant parameters come."""
+    errors = []
+    for method in job.methods:
+        error = job.metric("rmse_speed", method)
+        if method != "policy" and np.isfinite(error):
+            errors.append(f"{short_label(method)} {error:.3f}")
+    return (
+        f"{job.name}: a calibration; its parameters stay constant. RMSE of speed (m/s):"
+        f" {', '.join(errors)}."
+    )
+
+
+def _amount(jobs: Sequence[Job]) -> str:
+    pairs: set[tuple[str, str]] = set()
+    sources: dict[str, None] = {}
+    for job in jobs:
+        source = str(job.data.get("source", ""))
+        if source:
+            sources[source] = None
+        for pair in job.pairs["pair_id"].unique():
+            pairs.add((source, pair))
+    where = f" from {Path(next(iter(sources))).name}" if len(sources) == 1 else ""
+    return f"{plural(len(pairs), 'pair')} of leader and follower{where}"
+
+
+def _side(job: Job, baseline: str = "fixed") -> str:
+    if job.improvement("ci95_low", baseline) > 0:
+        return "yes"
+    return "no" if job.improvement("ci95_high", baseline) < 0 else "undecided"
+
+
+def _verdict(job: Job) -> str:
+    if not np.isfinite(job.improvement("mean")):
+        return f"{job.name}: no pair has a defined improvement."
+    pooled = ""
+    if "population" in job.baselines():
+        pooled = f"; over pooled calibration {_gain(job, 'population')}"
+    gain = _gain(job, "fixed")
+    return f"{job.name}: {_side(job)}. Improvement of the RMSE of speed: {gain}{pooled}."
+
+
+def _gain(job: Job, baseline: str) -> str:
+    mean = job.improvement("mean", baseline)
+    low, high = job.improvement("ci95_low", baseline), job.improvement("ci95_high", baseline)
+    if not np.isfinite(mean):
+        return "not defined"
+    sure = "no interval for a single driver"
+    if np.isfinite(low):
+        sure = f"95 % interval {percent(low, 1)} to {percent(high, 1)}"
+    said = f"{percent(mean, 1)} on average ({sure})"
+    opposite = contradiction(job.metrics, Comparison(baseline, TEST))
+    return f"{said}, {opposite}" if opposite else said

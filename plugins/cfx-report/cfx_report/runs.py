@@ -1,0 +1,198 @@
+"""Finds and reads the jobs that a user means: folders, sweeps, MLflow runs.
+
+No component is made, so a job of a plugin can be read where the plugin is not installed.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable, Iterator, Sequence
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from cfx.core.errors import DataError, TrackingError
+from cfx.core.job_folder import (
+    optional,
+    read_json,
+    without_password,
+)
+from cfx.core.storage import is_url, local_folder
+from cfx.figures.job import Job, Origin, read_job
+from cfx.results.store import (
+    download_run,
+    is_run_id,
+    open_store,
+    sqlite_file,
+    tracking_uri,
+    translate_errors,
+)
+from cfx_report.jobs import Runs, Unfinished
+from cfx_report.names import named
+
+_MOST = 1000
+"""Most jobs of one sweep that are asked for."""
+
+
+def tracked_runs(run_id: str) -> list[tuple[Path, Origin] | Unfinished]:
+    """Returns folder and origin of a tracked job; of a sweep's parent, those of each of its jobs.
+
+    Raises:
+        TrackingError: there is no such run, or its files are gone.
+    """
+    uri = tracking_uri(None)
+    file = sqlite_file(uri)
+    if not is_run_id(run_id) or (file is not None and not file.is_file()):
+        return [
+            (download_run(run_id), Origin(run_id))
+        ]  # it says what is wrong with the id or the store
+    store = open_store(uri, "cfx")
+    with translate_errors(f"read run {run_id} from {uri}"):
+        run = store.client.get_run(run_id)
+        sweep = run.data.tags.get("cfx.sweep_parent")
+        if sweep is None:
+            return [_found(run)]
+        jobs = store.client.search_runs(
+            [run.info.experiment_id], f"tags.`cfx.sweep` = '{sweep}'", max_results=_MOST
+        )
+    if not jobs:
+        raise TrackingError(f"run {run_id} is the parent of a sweep without any job")
+    return [_found(job) for job in sorted(jobs, key=lambda job: job.info.start_time or 0)]
+
+
+def _found(run: Any) -> tuple[Path, Origin] | Unfinished:
+    tags, info = run.data.tags, run.info
+    place = f"MLflow run {info.run_id}"
+    if info.status != "FINISHED":
+        return Unfinished(
+            place, tags.get("cfx.failure") or f"not finished: MLflow says {info.status}"
+        )
+    seconds = (info.end_time - info.start_time) / 1000 if info.end_time else None
+    # Where the job ran on this machine, its folder tells what was typed; MLflow does not keep that.
+    there = Path(tags.get("cfx.folder", ""))
+    return (
+        download_run(info.run_id),
+        Origin(
+            place=place,
+            started=datetime.fromtimestamp(info.start_time / 1000),
+            seconds=seconds,
+            version=tags.get("cfx.version", ""),
+            hydra=there if tags.get("cfx.folder") and (there / "metrics.json").is_file() else None,
+        ),
+    )
+
+
+_PASSED_OVER = {".hydra", "mlartifacts", "figures", "policy", "cache"}
+"""Folders below an output folder that hold no jobs of their own."""
+
+_MARKS = {"metrics.json", "config.yaml", "outcome.json"}
+"""Files that show a job's folder."""
+
+
+def read_runs(runs: Sequence[str]) -> Runs:
+    """Reads jobs.
+
+    Args:
+        runs: each an output folder of a job, a folder with jobs below it, the URL of either
+            (`output.url`), or the id of an MLflow run, also of a sweep's parent.
+
+    Raises:
+        DataError: a folder holds no finished job, or a job's file is damaged.
+        TrackingError: there is no such run.
+    """
+    jobs: dict[str, Job] = {}
+    given: dict[str, int] = {}
+    unfinished: dict[str, Unfinished] = {}
+    for number, run in enumerate(runs):
+        for found in _read(run):
+            if isinstance(found, Job):
+                jobs.setdefault(found.place, found)
+                given.setdefault(found.place, number)
+            else:
+                unfinished.setdefault(found.place, found)
+    # Folders of a sweep are named by content: only the jobs' names have an order that people see.
+    ordered = sorted(
+        named(tuple(jobs.values())), key=lambda job: (given[job.place], natural_order(job.name))
+    )
+    return Runs(tuple(ordered), tuple(unfinished.values()))
+
+
+def _read(run: str) -> list[Job | Unfinished]:
+    """Returns the jobs that one word on the command line stands for."""
+    if is_url(run):
+        copy = local_folder(run)
+        return _of_folder(
+            copy, lambda job: f"{run.rstrip('/')}/{job.relative_to(copy)}".removesuffix("/.")
+        )
+    path = Path(run).expanduser()
+    if path.exists():
+        return _of_folder(path, lambda job: str(job.absolute()))
+    return _of_mlflow(run)
+
+
+def _of_folder(folder: Path, place: Callable[[Path], str]) -> list[Job | Unfinished]:
+    """Returns the jobs below a folder.
+
+    Args:
+        folder: as it lies on this machine.
+        place: takes the folder of a job, and returns what people know it by.
+    """
+    if not folder.is_dir():
+        raise DataError(
+            f"{folder} is a file; give a job's output folder, a sweep's folder, or the id of an"
+            " MLflow run"
+        )
+    found = [_one(job, place(job)) for job in _job_folders(folder)]
+    if not any(isinstance(one, Job) for one in found):
+        raise DataError(
+            f"{folder} holds no finished job (a finished one has a metrics.json){_reasons(found)}"
+        )
+    return found
+
+
+def _of_mlflow(run: str) -> list[Job | Unfinished]:
+    found: list[Job | Unfinished] = []
+    for one in tracked_runs(run):
+        found.append(one if isinstance(one, Unfinished) else read_job(*one))
+    if not any(isinstance(one, Job) for one in found):
+        raise DataError(f"run {run} holds no finished job{_reasons(found)}")
+    return found
+
+
+def _reasons(found: Sequence[Job | Unfinished]) -> str:
+    text = ""
+    for one in found:
+        if isinstance(one, Unfinished):
+            text += f"; {one.place}: {one.reason}"
+    return text
+
+
+def _job_folders(folder: Path) -> Iterator[Path]:
+    """Yields the folders that a job was started in, `folder` or below it, by their names."""
+    for place, below, files in os.walk(folder):
+        if _MARKS & set(files) or ".hydra" in below:
+            below.clear()
+            yield Path(place)
+        else:
+            below[:] = sorted(set(below) - _PASSED_OVER, key=natural_order)
+
+
+def _one(folder: Path, place: str) -> Job | Unfinished:
+    if (folder / "metrics.json").is_file():
+        return read_job(folder, Origin(place))
+    status = optional(folder / "outcome.json", read_json) or {}
+    if status.get("code"):
+        return Unfinished(place, f"failed: {without_password(str(status.get('message', '')))}")
+    return Unfinished(place, "not finished: it has no metrics.json")
+
+
+def natural_order(name: str) -> list[tuple[int, str]]:
+    """Returns a sorting key that puts "i80/9" before "i80/11"."""
+    key = []
+    for part in re.split(r"(\d+)", name):
+        if part.isdigit():
+            key.append((int(part), ""))
+        elif part:
+            key.append((-1, part))
+    return key

@@ -1,0 +1,175 @@
+"""Calibrated parameters: their spread over drivers, shares at bounds, correlations."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from cfx.calibration.identifiability import NEAR
+from cfx.evaluation.result import Purpose
+from cfx.figures.calibration import (
+    AT_BOUND,
+    ParameterSpread,
+    SlicePanel,
+    draw_labels,
+    labels_of,
+    parameter_spreads,
+    slice_panels,
+)
+from cfx.figures.job import Job
+from cfx.figures.text import number as shown
+from cfx.figures.text import short, unit_label
+from cfx_report.jobs import Runs, of_purpose
+from cfx_report.section import Cell, Column, Section, Sheet, View, formatted, job_names, number
+
+
+class CalibrationSection(Section):
+    """Calibrated parameters: their spread over drivers, shares at bounds, correlations."""
+
+    title = "Calibrated parameters"
+    entry = "Calibration"
+    order = 1400
+    template = """
+<p>{{ caption("calibration") }}</p>
+{% for one in calibrations %}
+{% call fold(one.names, loop.first, "job") %}
+{{ drawn("calibration", one.job) }}
+{{ table(one.sheet, explain=loop.first) }}
+{% for name in ("identifiability", "fit_train_test") %}
+{% set beyond = drawn(name, one.job) %}
+{% if beyond %}
+<p>{{ caption(name) }}</p>
+{{ beyond }}
+{% endif %}
+{% endfor %}
+{% if one.labels %}
+<p>{{ caption("labels_over_time") }}</p>
+{{ figure(one.labels, "Per-window calibrated parameters over time, and how much they mattered",
+   "Pair") }}
+{% endif %}
+{% endcall %}
+{% endfor %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
+        """Return each calibration with the jobs that share it."""
+        together: dict[str, list[Job]] = {}
+        for job in of_purpose(runs.jobs, Purpose.ADAPTATION, Purpose.CALIBRATION):
+            spreads = spreads_of(job)
+            if spreads:
+                together.setdefault(_fingerprint(spreads), []).append(job)
+        found = []
+        for jobs in together.values():
+            table = sheet(spreads_of(jobs[0]), slices_of(jobs[0]))
+            about = {"names": job_names(jobs), "job": jobs[0], "sheet": table}
+            found.append({**about, "labels": _labels(jobs)})
+        return {"calibrations": found} if found else None
+
+
+def _labels(jobs: Sequence[Job]) -> dict[str, View]:
+    """Returns the per-window parameters of some pairs of the first job that has kept any."""
+    for job in jobs:
+        views = {}
+        if "labels" in job.tables:
+            axes = job.results.parameters
+            drivers = labels_of(job.tables["labels"], job.pairs, axes)
+            for pair_id, labels in drivers.items():
+                views[short(pair_id)] = View(draw_labels(pair_id, labels, axes))
+        if views:
+            return views
+    return {}
+
+
+def slices_of(job: Job) -> tuple[SlicePanel, ...]:
+    """Returns the loss along each tuned parameter of a job; () if it has kept none."""
+    if "slices" not in job.tables:
+        return ()
+    return slice_panels(job.tables["slices"], job.described_parameters)
+
+
+def spreads_of(job: Job) -> tuple[ParameterSpread, ...]:
+    """Returns the spread of each tuned parameter of a job."""
+    return parameter_spreads(job.pairs, job.described_parameters)
+
+
+def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:
+    found = hashlib.sha256()
+    for spread in spreads:
+        found.update(spread.axis.name.encode())
+        found.update(spread.values.tobytes())
+        found.update(spread.pooled.tobytes())
+    return found.hexdigest()
+
+
+class _Row(NamedTuple):
+    """A parameter; `near` and `flat` as of `SlicePanel`, NaN where the loss was not examined."""
+
+    spread: ParameterSpread
+    near: float
+    flat: float
+
+    def quantile(self, share: float) -> float:
+        return float(np.quantile(self.spread.values, share))
+
+    @property
+    def pooled(self) -> float:
+        return float(self.spread.pooled.mean()) if len(self.spread.pooled) else np.nan
+
+
+def sheet(spreads: Sequence[ParameterSpread], panels: Sequence[SlicePanel] = ()) -> Sheet:
+    """Returns a row per parameter."""
+    examined = {panel.axis.name: (panel.near, panel.flat) for panel in panels}
+    unknown = (np.nan, np.nan)
+    return Sheet.of(_COLUMNS, [_Row(one, *examined.get(one.axis.name, unknown)) for one in spreads])
+
+
+def _name(row: _Row) -> Cell:
+    axis = row.spread.axis
+    return Cell(unit_label(axis.name, axis.unit), second=axis.meaning)
+
+
+def _bounds(row: _Row) -> str:
+    assert row.spread.axis.low is not None
+    assert row.spread.axis.high is not None
+    return f"{shown(row.spread.axis.low)} to {shown(row.spread.axis.high)}"
+
+
+_COLUMNS: tuple[Column[_Row], ...] = (
+    Column("Parameter", _name),
+    Column("Bounds", _bounds, "Within them calibration has searched."),
+    Column("Default", lambda row: number(row.spread.default, ".3g"), "The model's."),
+    Column(
+        "Pooled", lambda row: number(row.pooled, ".3g"), "Mean over the folds' pooled parameters."
+    ),
+    Column(
+        "Median",
+        lambda row: number(row.quantile(0.5), ".3g"),
+        "Of the driver-specific values: half of the pairs have more.",
+    ),
+    Column(
+        "5 % to 95 %",
+        lambda row: f"{shown(row.quantile(0.05))} to {shown(row.quantile(0.95))}",
+        "Quantiles of the driver-specific values.",
+    ),
+    Column(
+        "At the lower bound",
+        lambda row: number(row.spread.at_low, ".0%"),
+        f"Share of the pairs within {formatted(AT_BOUND, '.0%')} of the range of it.",
+    ),
+    Column("At the upper bound", lambda row: number(row.spread.at_high, ".0%"), "The same."),
+    Column(
+        "Flat on",
+        lambda row: number(row.near, ".0%"),
+        f"Share of the range on which the loss is within {formatted(NEAR, '.0%')} of its best, the"
+        " others held; median over pairs.",
+    ),
+    Column(
+        "Flat for",
+        lambda row: number(row.flat, ".0%"),
+        "Share of the pairs for which that is the whole range: these recordings do not"
+        " determine the parameter, and its value says nothing of the driver.",
+    ),
+)

@@ -1,0 +1,334 @@
+"""All jobs side by side: errors and safety of each, and how much both depend on the seed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from itertools import chain
+from typing import Any
+
+import numpy as np
+
+from cfx.evaluation.metrics.base import MetricInfo
+from cfx.evaluation.result import METHODS, Purpose
+from cfx.figures.canvas import finite
+from cfx.figures.job import Job
+from cfx.figures.text import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
+from cfx_report.figures.jobs import draw_error_dots, error_limit
+from cfx_report.jobs import (
+    Runs,
+    any_baselines,
+    any_has_metric,
+    are_calibrations,
+    metric_title,
+    of_purpose,
+)
+from cfx_report.names import Row, any_adapts, baselines_of, methods_of, rows_over_seeds
+from cfx_report.section import (
+    Cell,
+    Column,
+    Section,
+    Sheet,
+    View,
+    formatted,
+    job_names,
+    number,
+    tested,
+)
+
+_RECORDED = "Behind recorded leaders"
+_IN_PLATOON = "Platoon behind a braking leader"
+_PLATOON = (
+    "Ten followers in a row, all driven by the policy, behind a leader that brakes from 15 to"
+    " 7 m/s and recovers."
+)
+
+_SAFETY = (
+    ("collisions", TEST, "fixed", ".0f", "Collisions"),
+    ("collisions", FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
+    ("hard_braking", TEST, "fixed", ".0f", "Hard braking"),
+    ("hard_braking", FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
+    ("jerk", TEST, "fixed", ".2f", "Jerk (m/s³)"),
+    ("at_bounds", TEST, "fixed", ".0%", "At bounds"),
+    ("platoon/head_to_tail", TEST, "population", ".2f", "Amplification"),
+    ("platoon/string_stable", TEST, "population", ".0%", "Stable"),
+    ("platoon/min_gap", TEST, "population", ".1f", "Least gap (m)"),
+    ("platoon/collisions", TEST, "population", ".0f", "Collisions"),
+)
+"""Measures: metric, part of the trajectories, baseline that stands below, format, heading."""
+
+_MEANINGS = {
+    "collisions": "Pairs in which the simulated gap becomes negative, on the test part.",
+    "hard_braking": "Frames with an acceleration below \N{MINUS SIGN}8 m/s², test part.",
+    "jerk": "Root mean square jerk on the test part, mean over the pairs.",
+    "at_bounds": "Share of the tuned parameters' values within 1 % of a bound.",
+    "platoon/head_to_tail": f"{_PLATOON} By how many times as much as the leader the last follower"
+    " slows down, mean over the networks; above 1 the platoon amplifies.",
+    "platoon/string_stable": f"{_PLATOON} Share of the networks with a string stable platoon: no"
+    " vehicle slows down more than the vehicle ahead (by over 0.1 m/s).",
+    "platoon/min_gap": f"{_PLATOON} The least gap of all.",
+    "platoon/collisions": f"{_PLATOON} Followers that collide, of all platoons.",
+}
+
+_ERRORS = (
+    ("rmse_speed", TEST),
+    ("rmse_gap", TEST),
+    ("rmse_speed", STEADY),
+    ("rmse_speed", FULL_TRAJECTORY),
+    ("rmse_gap", FULL_TRAJECTORY),
+)
+
+_GAINS = (
+    ("fixed", TEST),
+    ("shrunk", TEST),
+    ("population", TEST),
+    ("population", FULL_TRAJECTORY),
+)
+
+_JOB = Column[Job]("Job", lambda job: job.name)
+
+
+class ComparisonSection(Section):
+    """All jobs side by side: how close each is to the real drivers, and how safely it drives."""
+
+    title = "Side by side"
+    entry = "Side by side"
+    order = 200
+    template = """
+<p>Errors in m/s and m compare across driving models{{ " and learners" if adapts }}; lower is closer
+to the real driver.
+{% if runs.jobs | length > 1 %}
+The best of a column is bold where all jobs are tested on the same pairs.
+{% endif %}
+</p>
+{{ table(closeness, compact=true, explain=true) }}
+{% if unconditional %}
+<p class="note">{{ unconditional }}: the policy sets the acceleration itself. With constant
+parameters the model follows no leader, so that no calibration is a baseline. Its errors are an
+upper reference for the models that follow.</p>
+{% endif %}
+{{ figure(errors, "Errors of every job and method", "RMSE of") }}
+<h3>Is it safe, and smooth?</h3>
+<p>{{ numbers }}{{ "; the smaller line below is a baseline's" if adapts }}.</p>
+{{ table(safety, compact=true, explain=true) }}
+{% if every_metric %}
+{% call fold("Every metric of every job, test part") %}
+<p>{{ numbers }}{{ "; the smaller line: driver-specific calibration" if adapts }}.</p>
+{{ table(every_metric, compact=true, explain=true) }}
+{% endcall %}
+{% endif %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any]:
+        """Return the comparison of all jobs."""
+        jobs = runs.jobs
+        adapts = not are_calibrations(jobs)
+        whose = "the policy's" if adapts else "those of driver-specific calibration"
+        return {
+            "adapts": adapts,
+            "numbers": f"The numbers are {whose}",
+            "closeness": closeness(jobs),
+            "unconditional": job_names(of_purpose(jobs, Purpose.POLICY)),
+            "errors": absolute(jobs),
+            "safety": safety(jobs),
+            "every_metric": every_metric(jobs),
+        }
+
+
+def closeness(jobs: Sequence[Job]) -> Sheet:
+    """Returns a row per job: the errors of each method, and the policy's improvement."""
+    frames = {
+        TEST: tested(jobs),
+        FULL_TRAJECTORY: "the full trajectory of unseen drivers, from its first frame on",
+    }
+    columns = [_JOB]
+    for scope, group in (
+        (TEST, "Test part: RMSE of speed in m/s, below it of gap in m"),
+        (FULL_TRAJECTORY, "Full trajectories: the same"),
+    ):
+        for method in METHODS:
+            showing = [job for job in jobs if method in job.meaningful_methods]
+            if any_has_metric(showing, "rmse_speed", method, scope):
+                meaning = f"RMSE over {frames[scope]}, with {explained(method)}."
+                cell = partial(_error, scope=scope, method=method)
+                columns.append(Column(short_label(method), cell, meaning, group))
+    for baseline, scope in _GAINS:
+        if baseline in any_baselines(jobs, scope):
+            suffix = "" if scope == TEST else ", full"
+            meaning = (
+                f"Mean improvement of the RMSE of speed over {explained(baseline)}, on"
+                f" {frames[scope]}; below it the 95 % interval."
+            )
+            heading = f"over {short_label(baseline)}{suffix}"
+            cell = partial(_gain, baseline=baseline, scope=scope)
+            columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
+    return _with_best(Sheet.of(columns, jobs), jobs)
+
+
+def safety(jobs: Sequence[Job]) -> Sheet:
+    """Returns a row per job: the policy's measures of safety, and below them a baseline's."""
+    columns = [_JOB]
+    for metric, scope, baseline, form, heading in _SAFETY:
+        if any(job.has_metric(metric, job.judged, scope) for job in jobs):
+            meaning = _MEANINGS[metric] if scope == TEST else "The same over full trajectories."
+            if not are_calibrations(jobs):
+                meaning += f" Below it the same for {explained(baseline)}."
+            group = _IN_PLATOON if metric.startswith("platoon/") else _RECORDED
+            cell = partial(_with_baseline, metric=metric, scope=scope, baseline=baseline, form=form)
+            columns.append(Column(heading, cell, meaning, group))
+    return Sheet.of(columns, jobs)
+
+
+def every_metric(jobs: Sequence[Job]) -> Sheet | None:
+    """Returns a row per job with all metrics of the test part; None if no job lists its metrics."""
+    known: dict[str, MetricInfo] = {}
+    for job in jobs:
+        known |= {one.name: one for one in job.known_metrics if TEST in one.scopes}
+    columns = [_JOB]
+    for metric in known.values():
+        better = "" if metric.direction == "none" else f" The {metric.direction} the better."
+        meaning = f"{metric.meaning}, {metric.summary} over pairs.{better}"
+        cell = partial(_with_baseline, metric=metric.name, scope=TEST, baseline="fixed", form=".3g")
+        columns.append(Column(metric_title(metric), cell, meaning))
+    return Sheet.of(columns, jobs) if known else None
+
+
+def absolute(jobs: Sequence[Job]) -> dict[str, View]:
+    """Errors of each method in m/s and m; a view for each error and part of the trajectories."""
+    views = {}
+    for metric, scope in _ERRORS:
+        if not any(job.has_metric(metric, job.judged, scope) for job in jobs):
+            continue
+        signal, unit = ("speed", "m/s") if metric == "rmse_speed" else ("gap", "m")
+        values = {}
+        for method in METHODS:
+            errors = np.array([_shown_error(job, metric, method, scope) for job in jobs])
+            if np.isfinite(errors).any():
+                values[method] = errors
+        names = [job.name for job in jobs]
+        what = f"RMSE of {signal}, mean over pairs"
+        drawn = draw_error_dots(names, values, unit=unit, what=what)
+        note = error_limit(values, unit)[1]
+        views[f"{signal}, {jobs[0].scope_label(scope)}"] = View(drawn, note)
+    return views
+
+
+def _shown_error(job: Job, metric: str, method: str, scope: str) -> float:
+    return job.metric(metric, method, scope) if method in job.meaningful_methods else math.nan
+
+
+def _error(job: Job, scope: str, method: str) -> Cell:
+    if not (method in job.meaningful_methods and job.has_metric("rmse_speed", method, scope)):
+        return number(math.nan, "")
+    gap = job.metric("rmse_gap", method, scope)
+    second = formatted(gap, ".2f") if math.isfinite(gap) else ""
+    return number(job.metric("rmse_speed", method, scope), ".3f", second)
+
+
+def _gain(job: Job, baseline: str, scope: str) -> Cell:
+    if baseline not in job.baselines(scope):
+        return number(math.nan, "")
+    low = job.improvement("ci95_low", baseline, scope)
+    high = job.improvement("ci95_high", baseline, scope)
+    second = ""
+    if math.isfinite(low) and math.isfinite(high):
+        digits = 0 if max(abs(low), abs(high)) >= 1 else 1
+        ends = (percent(low, digits), percent(high, digits))
+        second = " to ".join(end.removesuffix(" %") for end in ends)
+    return number(job.improvement("mean", baseline, scope), "+.1%", second)
+
+
+def _with_baseline(job: Job, metric: str, scope: str, baseline: str, form: str) -> Cell:
+    """Returns the policy's number, and below it the baseline's."""
+    second = ""
+    if baseline != job.judged and job.has_metric(metric, baseline, scope):
+        second = formatted(job.metric(metric, baseline, scope), form)
+    return number(job.metric(metric, job.judged, scope), form, second)
+
+
+def _with_best(sheet: Sheet, jobs: Sequence[Job]) -> Sheet:
+    """Marks the policy's smallest error and largest improvement, if all are tested on the same."""
+    tests = set()
+    for job in jobs:
+        fingerprint = str(job.data.get("fingerprint"))
+        tests.add((fingerprint, frozenset(job.pairs["pair_id"]), job.split))
+    if len(jobs) < 2 or len(tests) > 1:
+        return sheet
+    rows = [list(row) for row in sheet.rows]
+    for k, column in enumerate(sheet.columns):
+        is_error = column.heading == "policy"
+        known = [float(row[k].sort) for row in rows if row[k].sort]
+        if known and (is_error or column.heading.startswith("over ")):
+            best = min(known) if is_error else max(known)
+            for row in rows:
+                row[k] = replace(row[k], best=row[k].sort == repr(best))
+    return replace(sheet, rows=tuple(map(tuple, rows)))
+
+
+class SeedsSection(Section):
+    """How much results depend on the seed: jobs that differ in it alone, in one row."""
+
+    title = "Over seeds"
+    entry = "Over seeds"
+    order = 100
+    template = """
+<p>Jobs that differ in the seed alone share a row: their mean, and below it the least and the
+largest of them. The seed decides how drivers are divided into folds, what optimizers draw, and how
+networks begin. A difference between rows that is no larger than these ranges says nothing. Whether
+it holds for other drivers, the intervals of each job say.</p>
+{{ table(rows, compact=true, explain=true) }}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
+        """Return the jobs over their seeds; nothing where no two differ in it alone."""
+        rows = rows_over_seeds(runs.jobs)
+        return None if len(rows) == len(runs.jobs) else {"rows": over_seeds(rows)}
+
+
+def over_seeds(rows: Sequence[Row]) -> Sheet:
+    """Returns a row per group of jobs: errors of each method, and the policy's improvement."""
+    where = tested(chain.from_iterable(row.jobs for row in rows))
+    columns = [
+        Column[Row](
+            "Jobs", lambda row: row.name, "Named by what differs between them, without the seed."
+        ),
+        Column("Seeds", lambda row: number(len(row.jobs), "d"), "Jobs of the row."),
+    ]
+    errors = "Test part: RMSE of speed in m/s"
+    for method in methods_of(rows):
+        meaning = f"RMSE of speed over {where}, with {explained(method)}."
+        cell = partial(_error_over_seeds, method=method)
+        columns.append(Column(short_label(method), cell, meaning, errors))
+    for baseline in baselines_of(rows):
+        meaning = f"Mean improvement of the RMSE of speed over {explained(baseline)}, test part."
+        heading, cell = (
+            f"over {short_label(baseline)}",
+            partial(_gain_over_seeds, baseline=baseline),
+        )
+        columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
+    return Sheet.of(columns, rows)
+
+
+def _error_over_seeds(row: Row, method: str) -> Cell:
+    """Returns a method's mean error and its range; empty where its jobs have no such method."""
+    if method == "policy" and not any_adapts([row]):
+        return number(np.nan, "")
+    return _mean_and_range(row.values("rmse_speed", method), ".3f")
+
+
+def _gain_over_seeds(row: Row, baseline: str) -> Cell:
+    return _mean_and_range(row.improvements("mean", baseline), "+.1%")
+
+
+def _mean_and_range(values: np.ndarray, form: str) -> Cell:
+    """Returns the mean, and below it the least and the largest value, where they differ."""
+    known = finite(values)
+    if not len(known):
+        return number(np.nan, form)
+    ends = []
+    for end in (known.min(), known.max()):
+        ends.append(formatted(float(end), form).removesuffix(" %"))
+    second = " to ".join(ends) if len(set(ends)) > 1 else ""
+    return number(float(known.mean()), form, second)

@@ -1,0 +1,179 @@
+"""Published numbers beside a job's, where the job ran one of a paper's experiments.
+
+`published.json` has the paper's numbers, what a column shows of a job, and what differs between the
+paper's set-up and a job's: another paper is another such file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from importlib import resources
+from operator import itemgetter
+from typing import Any
+
+from cfx.core.job_folder import without_folders
+from cfx.figures.job import Job
+from cfx.figures.text import percent_or_undefined, plural
+from cfx_report.jobs import Runs
+from cfx_report.section import Cell, Column, Section, Sheet, number, text
+
+
+class PaperSection(Section):
+    """Published numbers beside a job's, where the job ran one of a paper's experiments."""
+
+    title = "The paper's numbers beside these"
+    entry = "The paper's numbers"
+    order = 1100
+
+    template = """
+<p>{{ paper.citation }}</p>
+{% for one in experiments %}
+<h3>{{ one.heading }}</h3>
+{{ table(one.sheet, sortable=false) }}
+<ul>{% for words in one.verdicts %}<li>{{ words }}</li>{% endfor %}</ul>
+<p>{{ one.differences }}</p>
+{% endfor %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
+        """Return a comparison for each of the paper's experiments among the jobs."""
+        paper = published()
+        found = []
+        for experiment, about in paper["experiments"].items():
+            jobs = [job for job in runs.jobs if job.experiment == experiment]
+            if "ranked" in about:
+                jobs = _ranked(jobs, about["ranked"])
+            if jobs:
+                found.append(
+                    {
+                        "heading": about["heading"],
+                        "sheet": comparison(about, jobs),
+                        "verdicts": verdicts(about, jobs),
+                        "differences": differences(paper, about, jobs),
+                    }
+                )
+        return {"paper": paper, "experiments": found} if found else None
+
+
+def published() -> dict[str, Any]:
+    """Return what `published.json` holds."""
+    file = resources.files("cfx_report.sections") / "published.json"
+    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return found
+
+
+def comparison(about: Mapping[str, Any], jobs: Sequence[Job]) -> Sheet:
+    """Return the paper's rows of an experiment, and a row per job; names stand first."""
+    rows = [("paper", *row) for row in about["published"]]
+    for job in jobs:
+        values = [value_of(job, one["value"]) for one in about["columns"]]
+        rows.append((f"here: {job.name}", *values))
+    columns = [Column[Sequence[Any]]("", itemgetter(0))]
+    for place, one in enumerate(about["columns"], start=1):
+        cell = partial(_cell, place, one.get("form", ""))
+        columns.append(Column(one["heading"], cell, one.get("meaning", "")))
+    return Sheet.of(columns, rows)
+
+
+def value_of(job: Job, path: str) -> Any:
+    """Return what a column shows of a job: a text or a number, NaN where it is not known.
+
+    Args:
+        job: of the report.
+        path: `source`, `pair`, `pairs`, `component/GROUP`, `setting/PATH`, `metric/KEY` or
+            `improvement/STATISTIC/BASELINE`.
+    """
+    kind, *rest = path.split("/")
+    readers: dict[str, Callable[..., Any]] = {
+        "component": job.component,
+        "setting": job.setting,
+        "metric": lambda *parts: job.metrics.get("/".join(parts), math.nan),
+        "improvement": job.improvement,
+        "source": lambda: without_folders(str(job.data.get("source", ""))),
+        "pairs": job.pairs["pair_id"].nunique,
+        "pair": lambda: _pair(job),
+    }
+    return readers[kind](*rest)
+
+
+def _pair(job: Job) -> str:
+    """Return the numbers of a single pair, or how many there are."""
+    table = job.pairs.drop_duplicates("pair_id")
+    if len(table) > 1 or not {"follower_id", "leader_id"} <= set(table.columns):
+        return plural(len(table), "pair")
+    return f"{table['follower_id'].iloc[0]}/{table['leader_id'].iloc[0]}"
+
+
+def verdicts(about: Mapping[str, Any], jobs: Sequence[Job]) -> list[str]:
+    """Return what the jobs say of the paper's claim, and the claim."""
+    said = []
+    if about["judged"]:
+        gains = {job.name: float(value_of(job, about["judged"])) for job in jobs}
+        for name, gain in gains.items():
+            said.append(f"{name}: mean improvement {percent_or_undefined(gain, 1)}.")
+        known = [gain for gain in gains.values() if math.isfinite(gain)]
+        if len(known) > 1:
+            above = sum(gain > 0 for gain in known)
+            said.append(f"Above 0 % in {above} of {len(known)} jobs here.")
+    if "ranked" in about and math.isfinite(value_of(jobs[0], about["ranked"])):
+        said.append(f"The smallest of the last column here: {jobs[0].name}.")
+    for better in about.get("better", ()):
+        said += _compared(better, about["judged"], jobs)
+    return [*said, about["claim"]]
+
+
+def _ranked(jobs: Sequence[Job], path: str) -> list[Job]:
+    """Return the jobs by a number, the smallest first, those where it is not known last."""
+
+    def place(job: Job) -> tuple[bool, float]:
+        value = value_of(job, path)
+        return not math.isfinite(value), value
+
+    return sorted(jobs, key=place)
+
+
+def _compared(better: Mapping[str, str], judged: str, jobs: Sequence[Job]) -> list[str]:
+    """Say whether the policy fares better with one value than with another, others being equal."""
+    gains: dict[str, dict[str, float]] = {}
+    for job in jobs:
+        gain = value_of(job, judged)
+        if math.isfinite(gain):
+            alike = gains.setdefault(str(value_of(job, better["same"])), {})
+            alike[str(value_of(job, better["value"]))] = gain
+    said = []
+    for same, found in gains.items():
+        if {better["with"], better["than"]} <= set(found):
+            more = "better" if found[better["with"]] > found[better["than"]] else "no better"
+            said.append(
+                f"{same}: the policy fares {more} with {better['with']} than with {better['than']}"
+                " here; better in the paper."
+            )
+    return said
+
+
+def differences(paper: Mapping[str, Any], about: Mapping[str, Any], jobs: Sequence[Job]) -> str:
+    """Say what of the jobs' set-up is not the paper's; only what can be read off the jobs."""
+    pairs = about["pairs"]
+    listed = list(paper["differences"])
+    if pairs > 1:
+        number_of = {"what": "the number of pairs", "value": "pairs", "there": f"{pairs} in all"}
+        listed.insert(1, {**number_of, "same": str(pairs)})
+    parts = []
+    for one in listed:
+        here = sorted({str(value_of(job, one["value"])) for job in jobs} - {""})
+        if here and here != [one["same"]]:
+            parts.append(f"{one['what']} (here {' or '.join(here)}; there {one['there']})")
+    told = "; ".join([*parts, paper["unknown"]])
+    return f"The numbers need not agree, because these things differ, or may: {told}."
+
+
+def _cell(place: int, form: str, row: Sequence[Any]) -> Cell:
+    value = row[place]
+    if not form:
+        return text(value)
+    if isinstance(value, int | float):
+        return number(value, form)
+    return Cell("" if value is None else str(value), number=True)

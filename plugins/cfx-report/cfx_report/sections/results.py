@@ -1,0 +1,411 @@
+"""How much closer the policy drives, and the errors and metrics of each method."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+from cfx.evaluation.metrics.base import SCOPES, MetricInfo
+from cfx.evaluation.result import Purpose
+from cfx.evaluation.statistics import Improvement
+from cfx.figures.job import OUTSIDE, Job
+from cfx.figures.text import FULL_TRAJECTORY, MINUS, TEST, explained, label, short_label
+from cfx_report.figures.jobs import draw_overview, statistics_axis
+from cfx_report.jobs import Runs, any_baselines, are_calibrations, metric_title, of_purpose
+from cfx_report.section import (
+    Cell,
+    Column,
+    Section,
+    Sheet,
+    View,
+    interval,
+    method_cell,
+    methods_explained,
+    number,
+    tested,
+)
+
+
+class ResultsSection(Section):
+    """How much closer the policy drives, and the errors of each method."""
+
+    title = "Results"
+    entry = "Results"
+    order = 400
+    template = """
+{% if compared %}
+<h3>How much closer the policy drives</h3>
+<p>Mean improvement of the RMSE of speed over each baseline, with its 95 % interval. Where the
+interval contains 0, the job does not tell whether the policy helps.</p>
+{{ figure(overview, "Mean improvement of each job with its 95 % interval") }}
+{{ table(improvements, explain=true) }}
+{% endif %}
+<h3>Errors of each method</h3>
+{{ table(errors, explain=true) }}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any]:
+        """Return improvements over each baseline, and errors."""
+        jobs = runs.jobs
+        return {
+            "compared": of_purpose(jobs, Purpose.ADAPTATION),
+            "overview": overview(jobs),
+            "improvements": improvements(jobs),
+            "errors": errors(jobs),
+        }
+
+
+def overview(jobs: Sequence[Job]) -> dict[str, View]:
+    """Mean improvement with its 95 % interval; a view per baseline and part of the trajectories."""
+    views = {}
+    for scope in SCOPES:
+        suffix = "" if scope == TEST else f", {jobs[0].scope_label(scope)}"
+        for baseline in any_baselines(jobs, scope):
+            found = {}
+            for job in jobs:
+                if baseline in job.baselines(scope):
+                    found[job.name] = job.statistics(baseline, scope)
+            axis = statistics_axis(found.values(), baseline)
+            drawn = draw_overview(found, baseline, axis)
+            views[f"against {label(baseline)}{suffix}"] = View(drawn, axis.note)
+    return views
+
+
+class _Tested(NamedTuple):
+    job: Job
+    method: str
+
+    @property
+    def pairs(self) -> int:
+        return int((self.job.pairs["method"] == self.method).sum())
+
+
+def errors(jobs: Sequence[Job]) -> Sheet:
+    """Returns the errors: a row per job and method. The numbers are those of `metrics.json`."""
+    rows: list[_Tested] = []
+    methods: list[str] = []
+    for job in jobs:
+        methods += job.methods
+        rows += [_Tested(job, method) for method in job.meaningful_methods]
+    columns = [
+        Column[_Tested]("Job", lambda row: row.job.name),
+        Column("Method", lambda row: method_cell(row.method), methods_explained(methods)),
+        Column(
+            "Pairs",
+            lambda row: number(row.pairs, "d"),
+            "Pairs of a leader and a follower; the means are taken over them.",
+        ),
+        Column(
+            "RMSE of speed (m/s)",
+            partial(_metric, "rmse_speed"),
+            "Root mean square difference between the simulated and the measured speed of the"
+            f" follower over {tested(jobs)}, simulated in closed loop from the last measured state"
+            " on: the simulation sees the leader, never the measured follower. Mean over the pairs."
+            " Every method starts from the same state and covers the same frames.",
+        ),
+        Column(
+            "RMSE of gap (m)",
+            partial(_metric, "rmse_gap"),
+            "The same for the gap, bumper to bumper.",
+        ),
+        Column(
+            "Collisions",
+            partial(_metric, "collisions", form=".0f"),
+            "Pairs in which the simulated gap becomes negative on these frames.",
+        ),
+    ]
+    if any("fits" in job.tables for job in jobs):
+        columns += [
+            Column(
+                "Where calibrated: RMSE of speed (m/s)",
+                partial(_fitted, "rmse_speed"),
+                "The same over the part that driver-specific parameters were calibrated on. Where"
+                " the test part's error is much larger, they were fitted to more than the driver's"
+                " style.",
+            ),
+            Column(
+                "Where calibrated: RMSE of gap (m)",
+                partial(_fitted, "rmse_gap"),
+                "The same for the gap.",
+            ),
+        ]
+    if any_baselines(jobs, FULL_TRAJECTORY):
+        columns += [
+            Column(
+                "Full trajectory: RMSE of speed (m/s)",
+                partial(_metric, "rmse_speed", scope=FULL_TRAJECTORY),
+                "The same over the full trajectory of unseen drivers, from its first frame on."
+                " Driver-specific calibration does not compete here.",
+            ),
+            Column(
+                "Full trajectory: RMSE of gap (m)",
+                partial(_metric, "rmse_gap", scope=FULL_TRAJECTORY),
+                "The same for the gap.",
+            ),
+        ]
+    return Sheet.of(columns, rows)
+
+
+def _metric(name: str, row: _Tested, form: str = ".3f", scope: str = TEST) -> Cell:
+    return number(row.job.metric(name, row.method, scope), form)
+
+
+def _fitted(name: str, row: _Tested) -> Cell:
+    """Returns a method's mean error where it was calibrated."""
+    fits = row.job.tables.get("fits")
+    if fits is None or f"train_{name}" not in fits:
+        return number(math.nan, ".3f")
+    return number(float(fits.loc[fits["method"] == row.method, f"train_{name}"].mean()), ".3f")
+
+
+class _Compared(NamedTuple):
+    job: str
+    baseline: str
+    scope: str
+    found: Improvement
+
+
+def improvements(jobs: Sequence[Job]) -> Sheet:
+    """Returns the policy's improvement: a row per job, baseline and part of the trajectories."""
+    full = bool(any_baselines(jobs, FULL_TRAJECTORY))
+    scopes = (TEST, FULL_TRAJECTORY) if full else (TEST,)
+    baselines: list[str] = []
+    for scope in scopes:
+        baselines += any_baselines(jobs, scope)
+    rows = []
+    for scope in scopes:
+        for baseline in dict.fromkeys(baselines):
+            for job in jobs:
+                if baseline in job.baselines(scope):
+                    found = job.statistics(baseline, scope)
+                    rows.append(_Compared(job.name, baseline, scope, found))
+    columns = [
+        Column[_Compared]("Job", lambda row: row.job),
+        Column(
+            "Policy against",
+            lambda row: method_cell(row.baseline),
+            f"The baseline. {methods_explained(baselines)}",
+        ),
+    ]
+    if full:
+        frames = (
+            f"The frames that count. Test part: {tested(jobs)}. Full trajectory: from the first"
+            " frame on, of unseen drivers."
+        )
+        columns.append(Column("Frames", _frames, frames))
+    return Sheet.of([*columns, *STATISTICS], rows)
+
+
+def _frames(row: _Compared) -> str:
+    said = "test part" if row.scope == TEST else "full trajectory"
+    return said.replace(" ", "\N{NO-BREAK SPACE}")
+
+
+def _p_value(row: Any) -> Cell:
+    value = row.found.p_value
+    cell = number(value, ".2g")
+    return replace(cell, text="< 0.0001") if value < 1e-4 else cell
+
+
+STATISTICS: tuple[Column[Any], ...] = (
+    Column(
+        "Mean",
+        lambda row: number(row.found.mean, "+.1%"),
+        f"Improvement of a pair: (RMSE of the baseline {MINUS} RMSE of the policy) / RMSE of the"
+        " baseline, RMSE of the speed over these frames. Above 0 the policy is closer to the real"
+        " driver. Here the mean over the pairs.",
+    ),
+    Column(
+        "95 % interval",
+        lambda row: interval(row.found.ci95_low, row.found.ci95_high),
+        "Bootstrap confidence interval of that mean; drivers are resampled, each with all their"
+        " pairs.",
+    ),
+    Column(
+        "Trimmed mean",
+        lambda row: number(row.found.trimmed_mean, "+.1%"),
+        "Mean without the top and the bottom tenth of the pairs, as the paper averages.",
+    ),
+    Column(
+        "Median",
+        lambda row: number(row.found.median, "+.1%"),
+        "Half of the pairs improve more.",
+    ),
+    Column(
+        "Better for",
+        lambda row: number(row.found.win_rate, ".0%"),
+        "Share of the pairs with an improvement above 0.",
+    ),
+    Column(
+        "p",
+        _p_value,
+        "Two-sided Wilcoxon signed-rank test of the baseline's RMSE against the policy's, means"
+        " over each driver's pairs.",
+    ),
+    Column(
+        "Pairs",
+        lambda row: number(row.found.pairs, "d"),
+        "Pairs that count. One does not if the baseline has no error or a simulation diverges.",
+    ),
+)
+"""Of rows with an `Improvement`, `found`."""
+
+
+class SafetySection(Section):
+    """Safety and string stability of every method."""
+
+    title = "Safety and string stability"
+    entry = "Safety"
+    order = 500
+    figures = ("platoon",)
+    template = """
+{% if safety.rows %}
+{% call fold("Every method of every job") %}
+<p>Slowing down of the last follower divided by that of the leader, and by that of the first
+follower; shares of the networks whose platoons are string stable, and had settled before the leader
+braked. Hard braking counts frames below \N{MINUS SIGN}8 m/s². At limits: share of frames at a limit
+of acceleration, where the guard steps in.
+{% if adapts %}Outside: share of frames outside what the policy has learned from.{% endif %}</p>
+{{ table(safety, compact=true) }}
+{% endcall %}
+{% else %}
+<p>An older version of cfx wrote these jobs: they have no measure of it but the collisions.</p>
+{% endif %}
+{% for job in runs.jobs %}
+{% for scope, words in job.outside.items() %}
+<p>{{ job.name }}, {{ job.scope_label(scope) }}: {{ words }}.</p>
+{% endfor %}
+{% endfor %}
+{% set platoons = drawn_folds("platoon", runs.jobs) | trim %}
+{% if platoons %}
+<h3>Ten followers in a row</h3>
+<p>{{ caption("platoon") }}</p>
+{{ platoons }}
+{% endif %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any]:
+        """Return a table of all methods."""
+        adapts = not are_calibrations(runs.jobs)
+        return {"safety": safety_of_methods(runs.jobs), "adapts": adapts}
+
+
+class _Driven(NamedTuple):
+    job: Job
+    method: str
+
+
+_SAFETY = (
+    ("Collisions", "collisions", ".0f"),
+    ("Hard braking", "hard_braking", ".0f"),
+    ("Jerk (m/s³)", "jerk", ".2f"),
+    ("At bounds", "at_bounds", ".1%"),
+    ("At limits", "at_limits", ".1%"),
+    ("Outside", OUTSIDE, ".1%"),
+    ("last / leader", "platoon/head_to_tail", ".2f"),
+    ("last / first", "platoon/amplification", ".2f"),
+    ("Stable", "platoon/string_stable", ".0%"),
+    ("Settled", "platoon/settled", ".0%"),
+    ("Least gap (m)", "platoon/min_gap", ".1f"),
+    ("Collisions", "platoon/collisions", ".0f"),
+    ("Hard braking", "platoon/hard_braking", ".0f"),
+)
+"""Heading, metric and format."""
+
+
+def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
+    """Returns a row per job and method, with the recorded drivers for comparison."""
+    columns = [
+        Column[_Driven]("Job", lambda row: row.job.name),
+        Column(
+            "Driven by",
+            lambda row: method_cell(row.method),
+            "The method; real: the recorded drivers.",
+        ),
+    ]
+    for heading, metric, form in _SAFETY:
+        if metric == OUTSIDE and are_calibrations(jobs):
+            continue
+        recorded = "Behind recorded leaders, test part"
+        group = "Platoon" if metric.startswith("platoon/") else recorded
+        cell = partial(_measure, metric=metric, form=form)
+        columns.append(Column(heading, cell, group=group))
+    rows = []
+    for job in jobs:
+        for method in ("real", *job.meaningful_methods):
+            if any(math.isfinite(job.metric(metric, method)) for _, metric, _ in _SAFETY):
+                rows.append(_Driven(job, method))
+    return Sheet.of(columns, rows)
+
+
+def _measure(row: _Driven, metric: str, form: str) -> Cell:
+    return number(row.job.metric(metric, row.method), form)
+
+
+class MetricsSection(Section):
+    """All metrics of all methods, whoever brought them: what the files of a job say of them."""
+
+    title = "All metrics"
+    entry = "All metrics"
+    order = 600
+    template = """
+<p>Every metric that a job measured, those of plugins too: one number for each method, which is the
+mean, the sum, the least or the largest value over the pairs. Every method starts from the same
+measured state and covers the same frames.</p>
+{% for job, sheet in measured %}
+{% call fold(job.name, loop.first, "job") %}
+{{ table(sheet, compact=true) }}
+{% for one in job.data.get("metrics_left_out") or () %}
+<p class="lacking">
+{{ one.name }} of {{ one.distribution }} could not be measured: {{ one.reason }}
+</p>
+{% endfor %}
+{% endcall %}
+{% endfor %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any]:
+        """Return a table for each job."""
+        return {"measured": [(job, all_metrics(job)) for job in runs.jobs]}
+
+
+class _Measured(NamedTuple):
+    metric: MetricInfo
+    scope: str
+
+
+def all_metrics(job: Job) -> Sheet:
+    """Returns a row for each metric and part of the trajectories, a column for each method."""
+    methods = list(job.meaningful_methods)
+    if any(key.endswith("/real") for key in job.metrics):
+        methods.insert(0, "real")
+    columns = [
+        Column[_Measured]("Metric", lambda row: metric_title(row.metric)),
+        Column("Frames", lambda row: job.scope_label(row.scope)),
+        Column("Over pairs", lambda row: row.metric.summary),
+        Column("Better", lambda row: row.metric.direction.replace("none", "")),
+    ]
+    for method in methods:
+        cell = partial(_value, job, method)
+        columns.append(Column(short_label(method), cell, explained(method)))
+    columns.append(Column("Meaning", _meaning))
+    rows = []
+    for metric in job.known_metrics:
+        rows += [_Measured(metric, scope) for scope in metric.scopes]
+    return Sheet.of(columns, rows)
+
+
+def _meaning(row: _Measured) -> str:
+    said, distribution = row.metric.meaning, row.metric.distribution
+    if distribution and not distribution.startswith("cfx-driving"):
+        said += f" (of {distribution})"
+    return said
+
+
+def _value(job: Job, method: str, row: _Measured) -> Cell:
+    value = job.metric(row.metric.name, method, row.scope)
+    whole = math.isfinite(value) and value == round(value) and abs(value) < 1e6
+    return number(value, ".0f" if whole else ".3g")

@@ -1,0 +1,242 @@
+"""What was run: data, components and settings of each job, and its whole configuration."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Mapping, Sequence
+from operator import itemgetter
+from typing import Any
+
+import pandas as pd
+import yaml
+
+from cfx.core.job_folder import without_folders
+from cfx.evaluation.result import Purpose
+from cfx.figures.job import Job
+from cfx.figures.text import NOTHING
+from cfx_report.jobs import Runs, are_calibrations
+from cfx_report.section import Column, Section, Sheet
+
+_TOGETHER = {"platoon": " of whole platoons", "recording": " of whole recordings"}
+
+
+class RunSection(Section):
+    """What was run: data, components and settings of each job."""
+
+    title = "What was run"
+    entry = "What was run"
+    order = 300
+    template = """
+{% if unfinished %}
+<p class="lacking">Not in this page, because they have not finished:</p>
+<ul>{% for place, reason in unfinished %}<li>{{ place }}: {{ reason }}</li>{% endfor %}</ul>
+{% endif %}
+<dl class="facts">
+{% for name, value in common %}
+  <div><dt>{{ name }}</dt><dd>{{ value }}</dd></div>
+{% endfor %}
+</dl>
+{% if differing %}
+<h3>What differs between the jobs</h3>
+{{ table(differing) }}
+{% endif %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any]:
+        """Return what all jobs share, and a table of what they do not."""
+        unfinished = [(without_folders(one.place), one.reason) for one in runs.unfinished]
+        common, differing = facts(runs.jobs)
+        return {"unfinished": unfinished, "common": common, "differing": differing}
+
+
+class ConfigurationsSection(Section):
+    """The whole configuration of each job."""
+
+    title = "Configurations"
+    entry = "Configurations"
+    order = 2000
+    template = """
+<p>The whole configuration of each job, as it ran.</p>
+{% for name, place, configuration in configurations %}
+{% call fold(name) %}
+<p class="fine">{{ place }}</p>
+<pre>{{ configuration }}</pre>
+{% endcall %}
+{% endfor %}
+"""
+
+    def context(self, runs: Runs) -> Mapping[str, Any]:
+        """Return the place and the configuration of each job."""
+        found = []
+        for job in runs.jobs:
+            found.append((job.name, without_folders(job.place), _configuration(job)))
+        return {"configurations": found}
+
+
+def _configuration(job: Job) -> str:
+    """Returns the configuration as YAML, after what the protocol noted of its design."""
+    design = ""
+    notes = job.data.get("protocol")
+    if isinstance(notes, Mapping):
+        for name, value in notes.items():
+            design += f"# {str(name).replace('_', ' ')}: {value}\n"
+    text = yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True)
+    return design + without_folders(str(text))
+
+
+def facts(jobs: Sequence[Job]) -> tuple[list[tuple[str, str]], Sheet | None]:
+    """Returns what all jobs share, and a table of what they do not (None if they share all)."""
+    rows = []
+    names: dict[str, None] = {}
+    for job in jobs:
+        found = _facts(job, jobs)
+        rows.append({"Job": job.name, **found})
+        names |= dict.fromkeys(found)
+    common = []
+    columns = [Column[Mapping[str, str]]("Job", itemgetter("Job"))]
+    for name in names:
+        for row in rows:
+            row.setdefault(name, NOTHING)
+        values = {row[name] for row in rows}
+        if len(values) == 1:
+            common.append((name, values.pop()))
+        else:
+            columns.append(Column(name, itemgetter(name)))
+    return common, Sheet.of(columns, rows) if len(columns) > 1 else None
+
+
+def duration(seconds: float | None) -> str:
+    """Returns a duration as one says it: "42 s", "3 min 5 s", "2 h 10 min"."""
+    if seconds is None:
+        return "not recorded"
+    minutes, rest = divmod(round(seconds), 60)
+    hours, minutes_left = divmod(minutes, 60)
+    if hours:
+        return f"{hours} h {minutes_left} min"
+    if minutes:
+        return f"{minutes} min {rest} s"
+    return f"{rest} s"
+
+
+def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
+    table = job.pairs.drop_duplicates("pair_id")
+    found = {
+        "Started": f"{job.started:%Y-%m-%d %H:%M}" if job.started else "not recorded",
+        "Took": duration(job.seconds),
+        **_typed(job, jobs),
+    }
+    if job.experiment:
+        found["Preset"] = job.experiment
+    return found | {
+        "Data": without_folders(str(job.data.get("source") or job.component("data") or NOTHING)),
+        "Pairs": f"{len(table)} pairs of {table['driver'].nunique()} drivers",
+        "Left out": _left_out(job),
+        "Test frames of a pair": _range(table["frames"]),
+        "Drivers by style": str(job.setting("style.cluster") or NOTHING),
+        "Protocol": _protocol(job),
+        "Driving model": job.component("model") or NOTHING,
+        **_policy(job, jobs),
+        "Calibrated by": _calibration(job),
+        "Seed": str(job.config.get("seed", NOTHING)),
+        "cfx": job.version or "version not recorded",
+        "Read from": without_folders(job.place),
+    }
+
+
+def _calibration(job: Job) -> str:
+    said = job.component("optimizer") or NOTHING
+    objective = job.data.get("objective")
+    if isinstance(objective, Mapping):
+        said += f", which minimises {objective.get('name')} ({objective.get('unit')})"
+    return said
+
+
+def _left_out(job: Job) -> str:
+    parts = []
+    for one in job.data.get("dropped") or ():
+        if isinstance(one, Mapping):
+            parts.append(f"{one.get('count')} {one.get('unit')} ({one.get('reason')})")
+    return "; ".join(parts) or "nothing"
+
+
+def _typed(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
+    """Returns what was typed: of several jobs, what they share and what each has of its own."""
+    if job.overrides is None:
+        return {"Command": "not recorded"}
+    if len(jobs) == 1:
+        return {"Command": _command(job.overrides)}
+    shared = _shared_overrides(jobs)
+    own = []
+    for override in job.overrides:
+        if override not in shared:
+            own.append(override)
+    return {
+        "Command": f"{_command(shared)} …",
+        "Overrides of its own": without_folders(shlex.join(own)) or "none",
+    }
+
+
+def _command(overrides: Sequence[str]) -> str:
+    """Returns what was typed, without the folders of absolute paths."""
+    return without_folders(shlex.join(["python", "-m", "cfx", *overrides]))
+
+
+def _shared_overrides(jobs: Sequence[Job]) -> list[str]:
+    """Returns the overrides that all jobs with known overrides have, in order."""
+    known = [job.overrides for job in jobs if job.overrides is not None]
+    shared = []
+    for override in known[0]:
+        if all(override in other for other in known):
+            shared.append(override)
+    return shared
+
+
+def _range(values: pd.Series[Any]) -> str:
+    low, high = int(values.min()), int(values.max())
+    return str(low) if low == high else f"{low} to {high}"
+
+
+def _policy(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
+    """Returns which policy a job has; nothing where all jobs are calibrations."""
+    if are_calibrations(jobs):
+        return {}
+    return {"Policy": f"{job.component('policy')}, {_learned(job)}"}
+
+
+def _learned(job: Job) -> str:
+    """Says how the policy was learned."""
+    learner = job.component("learner")
+    if job.purpose is Purpose.CALIBRATION:
+        return "constant parameters, nothing is learned"
+    if learner:
+        return f"learned by {learner}"
+    return f"as it was learned in {job.setting('protocol.run')}"
+
+
+def _protocol(job: Job) -> str:
+    name = job.component("protocol")
+    train, test = f"{100 * job.split:.3g} %", f"{100 * (1 - job.split):.3g} %"
+    parts = (
+        f"driver-specific calibration uses the first {train} of a driver's own trajectory, the test"
+        f" part is the last {test}"
+    )
+    if name == "within_driver" and job.split == 1:
+        said = "calibrated on whole trajectories, of which the errors are"
+    elif name == "within_driver":
+        used = "calibrated" if job.purpose is Purpose.CALIBRATION else "calibrated and learned"
+        said = f"{used} on the first {train} of each pair, tested on the last {test}"
+    elif job.setting("protocol.folds") and not job.setting("protocol.run"):
+        folds = f"{job.setting('protocol.folds')} folds"
+        apart = _TOGETHER.get(str(job.setting("protocol.together")), "")
+        said = (
+            "trained on some drivers and tested on unseen drivers: nobody is, as follower, in both;"
+            f" {folds}{apart}; {parts}"
+        )
+    elif job.setting("protocol.run"):
+        said = (
+            "nothing is trained: another job's policy is tested, and pooled calibration is that of"
+            f" the drivers it learned from; {parts}"
+        )
+    else:
+        return name
+    return f"{name}: {said}"

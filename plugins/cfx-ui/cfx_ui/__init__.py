@@ -1,0 +1,1 @@
+"""The tracked jobs in the user interface of MLflow."""
