@@ -31,7 +31,7 @@ from cfx.core.errors import DataError, listed
 from cfx.data.files import Floats
 from cfx.data.pairs import Pair, PairSet
 from cfx.data.plausible import doubts
-from cfx.data.series import driven
+from cfx.data.tracks import driven
 from cfx.data.units import factor
 
 log = logging.getLogger(__name__)
