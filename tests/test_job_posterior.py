@@ -6,10 +6,12 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from rich.text import Text
 
 import cfx
 from cfx.core.errors import ConfigError
 from cfx.models.krauss import Krauss
+from cfx.results.known import KnownParameters
 
 QUICK = [
     "debug=quick",
@@ -47,8 +49,16 @@ def test_intervals_stand_beside_the_same_point_estimates(
         assert (rows[f"median_{name}"] < rows[f"high_{name}"]).all()
         assert (rows[f"contraction_{name}"] < 1).all()
         assert others[f"median_{name}"].isna().all()
-        share = float((rows[f"contraction_{name}"] >= 0.3).mean())
+        known_well = (rows[f"contraction_{name}"] >= 0.3) & (rows["pareto_k"] <= 0.7)
+        share = float(known_well.mean())
         assert known.metrics[f"posterior/determined/{name}"] == share
+    assert known.metrics["posterior/reliable"] == float((rows["pareto_k"] <= 0.7).mean())
+    draws = pd.read_parquet("known/posterior.parquet").groupby("pair_id")
+    for name in known.evaluation.names:
+        middle = draws[f"parameter_{name}"].median()[rows["pair_id"]].to_numpy()
+        assert (rows[f"low_{name}"] < middle).all()
+        assert (middle < rows[f"high_{name}"]).all()
+    assert not Path("known/population.parquet").exists()
     assert "noise_scale" not in pd.read_parquet("plain/fits.parquet")
 
 
@@ -61,6 +71,20 @@ def test_a_population_as_the_prior_leaves_less_doubt() -> None:
         width = [rows[f"high_{name}"] - rows[f"low_{name}"] for name in Krauss().space.names]
         doubt[kind] = pd.concat(width, axis=1).mean()
     assert (doubt["hierarchical"] < doubt["laplace"]).all()
+    drawn = pd.read_parquet("hierarchical/population.parquet")
+    assert len(drawn) == 1000
+    low, high = Krauss().space.bounds()
+    assert (drawn.to_numpy() >= low.numpy()).all()
+    assert (drawn.to_numpy() <= high.numpy()).all()
+
+
+def test_intervals_that_are_not_to_be_relied_on_are_named() -> None:
+    fits = {"pair_id": ["a", "b"], "method": "fixed", "noise_scale": 0.1, "noise_left": 0.0}
+    rows = pd.DataFrame({**fits, "pareto_k": [0.3, 0.8], "effective_samples": [500.0, 20.0]})
+    known = KnownParameters(rows, ())
+    assert known.metrics()["posterior/reliable"] == 0.5
+    said = [str(one) for one in known.printed() if isinstance(one, Text)]
+    assert said[0].startswith("Do not rely on the intervals of 1 of 2 pairs (b):")
 
 
 def test_another_simulator_is_refused() -> None:

@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from cfx.calibration.posterior.levels import DETERMINED, LEVEL
+from cfx.calibration.posterior.levels import DETERMINED, LEVEL, RELIABLE
 from cfx.core.parameters import Parameter
 from cfx.results.table import Findings
 
@@ -40,15 +40,26 @@ class KnownParameters:
         return cls(fits[fits["method"] == "fixed"], tuned)
 
     def determined(self, name: str) -> int:
-        """Returns how many pairs' recordings determine a parameter."""
-        return int((self.rows[f"contraction_{name}"] >= DETERMINED).sum())
+        """Returns how many pairs' recordings determine a parameter, as far as that is known."""
+        return int(((self.rows[f"contraction_{name}"] >= DETERMINED) & self.reliable).sum())
+
+    @property
+    def reliable(self) -> pd.Series:
+        """Whether a pair's intervals are to be relied on."""
+        return self.rows["pareto_k"] <= RELIABLE
 
     def metrics(self) -> dict[str, float]:
-        """Returns `posterior/determined/NAME`, the share of pairs, and `posterior/noise_left`."""
+        """Returns what MLflow keeps too.
+
+        `posterior/determined/NAME` and `posterior/reliable` are shares of pairs,
+        `posterior/noise_left` and `posterior/effective_samples` medians.
+        """
         found = {}
         for one in self.parameters:
             found[f"posterior/determined/{one.name}"] = self.determined(one.name) / len(self.rows)
-        found["posterior/noise_left"] = float(self.rows["noise_left"].median())
+        found["posterior/reliable"] = float(self.reliable.mean())
+        for name in ("noise_left", "effective_samples"):
+            found[f"posterior/{name}"] = float(self.rows[name].median())
         return found
 
     def printed(self) -> list[RenderableType]:
@@ -74,10 +85,19 @@ class KnownParameters:
     def _sentences(self) -> list[str]:
         sentences = []
         pairs = len(self.rows)
+        doubtful = list(self.rows["pair_id"][~self.reliable])
+        if doubtful:
+            few = ", ".join(map(str, doubtful[:3])) + (" ..." if len(doubtful) > 3 else "")
+            sentences.append(
+                f"Do not rely on the intervals of {len(doubtful)} of {pairs} pairs ({few}):"
+                f" samples of these posteriors do not settle (pareto_k above {RELIABLE} in"
+                " fits.parquet), and such intervals are too narrow."
+            )
         open_ones = []
         for one in self.parameters:
-            if self.determined(one.name) < pairs:
-                open_ones.append(f"{one.name} for {pairs - self.determined(one.name)}")
+            left_open = int(self.reliable.sum()) - self.determined(one.name)
+            if left_open:
+                open_ones.append(f"{one.name} for {left_open}")
         if open_ones:
             sentences.append(
                 f"Hardly known after these recordings: {', '.join(open_ones)} of {pairs} pairs"

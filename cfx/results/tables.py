@@ -292,6 +292,10 @@ class Fits(ResultTable):
         Column("noise_scale", "m/s or m", "what each step of the noise adds", required=False),
         Column("noise_correlation", "1", "of the noise, one step later", required=False),
         Column("noise_left", "1", "the same of what its model leaves; 0: all", required=False),
+        Column("effective_samples", "1", "effective sample size of the intervals", required=False),
+        Column(
+            "pareto_k", "1", "above 0.7 these intervals are not to be relied on", required=False
+        ),
     )
 
     def metrics(self, findings: Findings) -> dict[str, float]:
@@ -301,6 +305,32 @@ class Fits(ResultTable):
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[RenderableType]:
         known = KnownParameters.of(findings)
         return [] if known is None else known.printed()
+
+
+class PosteriorDraws(ResultTable):
+    """Draws of each driver's parameters from their posterior."""
+
+    meaning = (
+        "equally likely values of each driver's parameters, as correlated as the recording leaves"
+        " them (`calibration.posterior`)"
+    )
+    order = 211
+    columns = (
+        PAIR,
+        Column("draw", "", "its number within the pair", "int"),
+        Column("parameter_NAME", "as of the parameter", "the parameter"),
+    )
+
+
+class PopulationDraws(ResultTable):
+    """New drivers of the population that all recordings give."""
+
+    meaning = (
+        "parameters of new drivers, as different and as correlated as the recorded ones"
+        " (`calibration.posterior=hierarchical`)"
+    )
+    order = 212
+    columns = (Column("parameter_NAME", "as of the parameter", "the parameter"),)
 
 
 def history_metrics(history: pd.DataFrame) -> dict[str, float]:

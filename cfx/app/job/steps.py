@@ -53,7 +53,7 @@ _CONSTANT = ("default", "population", "fixed")
 def calibration_tables(
     context: ProtocolContext, evaluation: Evaluation, settings: CalibrationSettings
 ) -> dict[str, pd.DataFrame]:
-    """Returns the tables `slices` and `fits` of a calibration of driver-specific parameters.
+    """Returns the tables of a calibration of driver-specific parameters.
 
     There are none where nothing was calibrated per driver, nor where another program simulates
     (`simulator=sumo`): it would take minutes.
@@ -65,6 +65,7 @@ def calibration_tables(
             driver-specific parameters were calibrated on, and on the test part, if there is one
             (`split`). With a posterior
             the rows of `fixed` have its columns (`ParameterIntervals.columns`) for that part too.
+        posterior, population: with a posterior, see `ParameterIntervals.tables`.
     """
     calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
     if not calibrated or not isinstance(context.simulator, MemoryStepper):
@@ -81,6 +82,7 @@ def calibration_tables(
     batch = context.batch[chosen.to(context.batch.lengths.device)]
     last = Split.of(context.pairs, context.windows, context.split).frame[chosen]
     fits = []
+    tables = {}
     for method in evaluation.methods:
         if method in _CONSTANT:
             parameters = _parameters(evaluation, method, ids, batch.leader_length)
@@ -89,23 +91,17 @@ def calibration_tables(
             if context.split == 1:  # nothing was tested
                 rows = rows.drop(columns=["test_rmse_speed", "test_rmse_gap"])
             if method == "fixed" and settings.posterior != "none":
-                known = _intervals(context.calibrator.solver, batch, last, parameters, settings)
-                rows = rows.join(known.set_axis(ids), on="pair_id")
+                # SciPy's and ArviZ's statistics are imported for that alone.
+                from cfx.calibration.posterior.intervals import parameter_intervals
+
+                solver = context.calibrator.solver
+                known = parameter_intervals(solver, batch, last, parameters, settings)
+                rows = rows.join(pd.DataFrame(known.columns(), index=ids), on="pair_id")
+                tables = known.tables(ids, solver.seed)
             fits.append(rows)
     best = _parameters(evaluation, "fixed", ids, batch.leader_length)
-    table = slices(context.calibrator, batch, last, best, ids)
-    return {"slices": table, "fits": pd.concat(fits, ignore_index=True)}
-
-
-def _intervals(
-    solver: Solver, batch: PairBatch, last: Tensor, best: Tensor, settings: CalibrationSettings
-) -> pd.DataFrame:
-    """Returns the posterior's columns, a row per pair, in the order of the batch."""
-    # SciPy's interpolation is imported for that alone.
-    from cfx.calibration.posterior.intervals import parameter_intervals
-
-    known = parameter_intervals(solver, batch, last, best, settings)
-    return pd.DataFrame(known.columns())
+    tables["slices"] = slices(context.calibrator, batch, last, best, ids)
+    return {**tables, "fits": pd.concat(fits, ignore_index=True)}
 
 
 def _parameters(evaluation: Evaluation, method: str, ids: list[str], like: Tensor) -> Tensor:

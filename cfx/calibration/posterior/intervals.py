@@ -5,23 +5,21 @@ Shapes: P drivers, n tuned parameters.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.posterior.density import ParameterPrior, Posterior
-from cfx.calibration.posterior.laplace import (
-    Normal,
-    bytes_of_marginals,
-    laplace,
-    marginal_quantiles,
-)
+from cfx.calibration.posterior.importance import sample
+from cfx.calibration.posterior.laplace import Normal, laplace, likely_starts
 from cfx.calibration.posterior.levels import LEVEL
-from cfx.calibration.posterior.population import fit_population
+from cfx.calibration.posterior.population import Population, fit_population
 from cfx.calibration.prior import squashed
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
@@ -30,8 +28,20 @@ from cfx.simulation.trajectory import Segments
 
 _SHARES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
 
+NEW_DRIVERS = 1000
+"""Drivers that are drawn from a population and kept."""
+
 _WORK = 10**8
 """Vehicle steps that belong together: enough for a compiled kernel."""
+
+
+_OF_DRIVERS = (
+    "noise_scale",
+    "noise_correlation",
+    "noise_left",
+    "effective_samples",
+    "pareto_k",
+)
 
 
 @dataclass(frozen=True)
@@ -47,6 +57,10 @@ class ParameterIntervals:
         noise_correlation: `(P,)`, of the noise with itself one step later.
         noise_left: `(P,)`, the same correlation of what the noise's model leaves of it; near 0
             where the model is right.
+        effective_samples: `(P,)`, effective sample size that the quantiles rest on.
+        pareto_k: `(P,)`, above 0.7 the intervals are not to be relied on.
+        draws: parameters, `(P, DRAWS, n)`, SI units: as correlated as a recording leaves them.
+        population: from which all drivers come, if it was asked for.
     """
 
     names: tuple[str, ...]
@@ -57,6 +71,10 @@ class ParameterIntervals:
     noise_scale: Tensor
     noise_correlation: Tensor
     noise_left: Tensor
+    effective_samples: Tensor
+    pareto_k: Tensor
+    draws: Tensor
+    population: Population | None = None
 
     def columns(self) -> dict[str, NDArray[np.float64]]:
         """Returns columns for a row per driver: `median_NAME`, `noise_scale` and so on."""
@@ -64,8 +82,28 @@ class ParameterIntervals:
         for kind in ("median", "low", "high", "contraction"):
             for number, name in enumerate(self.names):
                 found[f"{kind}_{name}"] = getattr(self, kind)[:, number].numpy()
-        for kind in ("noise_scale", "noise_correlation", "noise_left"):
+        for kind in _OF_DRIVERS:
             found[kind] = getattr(self, kind).numpy()
+        return found
+
+    def tables(self, ids: Sequence[str], seed: int) -> dict[str, pd.DataFrame]:
+        """Returns `posterior`, draws of each driver's parameters, and `population`, new drivers.
+
+        The second is there only where a population was asked for.
+
+        Args:
+            ids: of the pairs.
+            seed: of the new drivers.
+        """
+        columns = [f"parameter_{name}" for name in self.names]
+        pairs, draws, _ = self.draws.shape
+        values = pd.DataFrame(self.draws.flatten(0, 1).numpy(), columns=columns)
+        values.insert(0, "pair_id", np.repeat(np.asarray(ids, dtype=object), draws))
+        values.insert(1, "draw", np.tile(np.arange(draws), pairs))
+        found = {"posterior": values}
+        if self.population is not None:
+            drawn = self.population.draw(NEW_DRIVERS, seed=seed).numpy()
+            found["population"] = pd.DataFrame(drawn, columns=columns)
         return found
 
 
@@ -88,24 +126,36 @@ def parameter_intervals(
     posterior = posterior_of(solver, batch, last, settings)
     space = solver.space
     best = squashed(space.to_unit(best.to("cpu", torch.float64)))
-    starts = torch.stack([best, squashed(space.to_unit(space.defaults())).expand_as(best)], dim=1)
+    default = squashed(space.to_unit(space.defaults())).expand_as(best)
+    starts = torch.cat(
+        [best[:, None], default[:, None], likely_starts(posterior, solver.seed)], dim=1
+    )
+    population = None
     if settings.posterior == "hierarchical":
-        _, posterior, normal = fit_population(posterior, starts)
+        population, posterior, normal = fit_population(posterior, starts)
     else:
         normal = laplace(posterior, starts)
-    size = max(1, solver.memory // (4 * bytes_of_marginals(posterior)))
     shares = torch.tensor(_SHARES, dtype=torch.float64)
-    parts = []
-    for drivers in torch.split(torch.arange(len(best)), size):
-        own = Normal(*(values[drivers] for values in normal))
-        parts.append(marginal_quantiles(posterior.take(drivers), own, shares))
-    quantiles = torch.cat(parts)
+    found = sample(posterior, normal, shares, seed=solver.seed, memory=solver.memory)
     prior = posterior.prior.quantiles(shares, len(space))
-    width = (quantiles[:, 2] - quantiles[:, 0]) / (prior[2] - prior[0])
-    values = space.from_unit(torch.sigmoid(quantiles))
+    width = (found.quantiles[:, 2] - found.quantiles[:, 0]) / (prior[2] - prior[0])
+    values = space.from_unit(torch.sigmoid(found.quantiles))
     low, median, high = values.unbind(1)
     scale, correlation, left = _noise(posterior, normal)
-    return ParameterIntervals(space.names, low, median, high, 1.0 - width, scale, correlation, left)
+    return ParameterIntervals(
+        space.names,
+        low,
+        median,
+        high,
+        contraction=1.0 - width,
+        noise_scale=scale,
+        noise_correlation=correlation,
+        noise_left=left,
+        effective_samples=found.effective,
+        pareto_k=found.pareto_k,
+        draws=space.from_unit(torch.sigmoid(found.draws[..., : len(space)])),
+        population=population,
+    )
 
 
 def posterior_of(

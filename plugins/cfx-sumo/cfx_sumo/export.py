@@ -30,6 +30,9 @@ NAME = "drivers.add.xml"
 ALL_DRIVERS = "drivers"
 """The vTypeDistribution of all drivers."""
 
+POPULATION = "population"
+"""The vTypeDistribution of new drivers, drawn from the population of the recorded ones."""
+
 _WITHOUT_LAG = {"variant": "sumo", "leader_deceleration": None}
 """Settings with which krauss is SUMO's KraussOrig1, once its t_i is 0."""
 
@@ -47,6 +50,8 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     The parameters are those of the method `fixed`: calibrated to the driver, constant. The
     distribution `drivers` holds them all. Each vType is one driver's whole set, so that a vehicle
     drawn from it has parameters that belong together, as correlated as they are among drivers.
+    Where the job has found a population (`calibration.posterior=hierarchical`), the distribution
+    `population` holds new drivers of it: what a recording leaves open does not widen it.
 
     Args:
         run: a job's output folder, or the id of its MLflow run.
@@ -63,6 +68,7 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     folder, home = _folder(run)
     node, table = _read(folder)
     kind, notes = vtypes(node, table)
+    drawn = _population(folder)
     notes += _undetermined(table)
     step = _time_step(folder)
     notes.append(
@@ -75,14 +81,21 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
             " quarter); data.time_step=0.1 calibrates in steps of 0.1 s"
         )
     path = Path(output).expanduser() if output else home / NAME
-    write_output(path, _xml(table, kind, notes), "the list of vTypes")
+    lines = _drivers(table, kind)
+    if drawn is not None:
+        new, _ = vtypes(node, drawn)
+        lines += _distribution(POPULATION, drawn, new, _columns(new, len(drawn)))
+    write_output(path, _xml(lines, notes), "the list of vTypes")
     first = quoteattr(str(table["cluster"].iloc[0]))
     counts = []
     for name, count in table.groupby("cluster", sort=False).size().items():
         counts.append(f"{name} {count}")
+    further = ""
+    if drawn is not None:
+        further = f"; {len(drawn)} drawn from their population in '{POPULATION}'"
     return [
         f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster:"
-        f" {', '.join(counts)}; all together in '{ALL_DRIVERS}'",
+        f" {', '.join(counts)}; all together in '{ALL_DRIVERS}'{further}",
         *[f"Note: {note}" for note in notes],
         f"Use it: sumo --step-length {step:g} --additional-files {path.absolute()}; then in a flow"
         f' or vehicle: type="{ALL_DRIVERS}", or type={first}',
@@ -178,6 +191,17 @@ def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     return node, fixed
 
 
+def _population(folder: Path) -> pd.DataFrame | None:
+    """Returns new drivers that a job has drawn; None if it has found no population."""
+    path = folder / f"{POPULATION}.parquet"
+    if not path.exists():
+        return None
+    try:
+        return pd.read_parquet(path).reset_index(drop=True)
+    except (OSError, ValueError) as error:
+        raise DataError(f"{path} cannot be read ({error}); run the job again") from error
+
+
 def _time_step(folder: Path) -> float:
     """Returns the time step in which a job calibrated, s; its policy says so."""
     path = folder / "policy" / "policy.json"
@@ -211,31 +235,52 @@ def _flat(table: pd.DataFrame, row: Any) -> list[str]:
     return [name.removeprefix(COLUMN) for name in columns if table[name][row] == 1]
 
 
-def _xml(table: pd.DataFrame, kind: VType, notes: list[str]) -> str:
-    columns: dict[str, list[str]] = {}
-    for name, value in {"sigma": "0", **kind.attributes}.items():
-        columns[name] = _texts(value, len(table))
-    lines = [
-        '<?xml version="1.0" encoding="UTF-8"?>',
-        "<!-- Constant parameters of recorded drivers, each calibrated by cfx.",
-    ]
-    for note in notes:
-        lines.append(f"     {note}.")
-    lines += ["-->", "<additional>"]
-    names = []
+def _xml(lines: list[str], notes: list[str]) -> str:
+    said = [f"     {note}." for note in notes]
+    return "\n".join(
+        [
+            '<?xml version="1.0" encoding="UTF-8"?>',
+            "<!-- Constant parameters of recorded drivers, each calibrated by cfx.",
+            *said,
+            "-->",
+            "<additional>",
+            *lines,
+            "</additional>",
+            "",
+        ]
+    )
+
+
+def _drivers(table: pd.DataFrame, kind: VType) -> list[str]:
+    """Returns a distribution of each cluster, and one of all drivers."""
+    lines, names = [], []
+    columns = _columns(kind, len(table))
     for cluster, rows in table.groupby("cluster", sort=False):
-        lines.append(f"    <vTypeDistribution id={quoteattr(str(cluster))}>")
-        for place, row in enumerate(rows.index):
-            attributes = {name: values[row] for name, values in columns.items()}
-            names.append(f"{cluster}_{place}")
-            about = {"pair": rows["pair_id"][row]}
-            flat = _flat(table, row)
-            if flat:
-                about["flat"] = " ".join(flat)
-            lines += _vtype(names[-1], kind, attributes, about)
-        lines.append("    </vTypeDistribution>")
-    lines.append(f'    <vTypeDistribution id="{ALL_DRIVERS}" vTypes={quoteattr(" ".join(names))}/>')
-    return "\n".join([*lines, "</additional>", ""])
+        lines += _distribution(str(cluster), rows, kind, columns)
+        names += [f"{cluster}_{place}" for place in range(len(rows))]
+    together = quoteattr(" ".join(names))
+    return [*lines, f'    <vTypeDistribution id="{ALL_DRIVERS}" vTypes={together}/>']
+
+
+def _columns(kind: VType, count: int) -> dict[str, list[str]]:
+    """Returns attributes of each of `count` vehicles, by name."""
+    attributes = {"sigma": "0", **kind.attributes}
+    return {name: _texts(value, count) for name, value in attributes.items()}
+
+
+def _distribution(
+    name: str, rows: pd.DataFrame, kind: VType, columns: Mapping[str, list[str]]
+) -> list[str]:
+    """Returns a distribution of the vTypes of some rows; `columns` has the attributes of all."""
+    lines = [f"    <vTypeDistribution id={quoteattr(name)}>"]
+    for place, row in enumerate(rows.index):
+        attributes = {key: values[row] for key, values in columns.items()}
+        about = {"pair": rows["pair_id"][row]} if "pair_id" in rows else {}
+        flat = _flat(rows, row)
+        if flat:
+            about["flat"] = " ".join(flat)
+        lines += _vtype(f"{name}_{place}", kind, attributes, about)
+    return [*lines, "    </vTypeDistribution>"]
 
 
 def _vtype(

@@ -141,6 +141,26 @@ def test_krauss_loses_its_brake_build_up_time_and_says_so(tmp_path: Path) -> Non
     assert not any("KraussOrig1 has no" in line for line in export(same))
 
 
+def test_new_drivers_of_a_population_keep_their_parameters_together(tmp_path: Path) -> None:
+    folder = job(tmp_path / "idm", {"name": "idm"})
+    drawn = pd.DataFrame(
+        {
+            "parameter_v0": [20.0, 30.0, 25.0],
+            "parameter_T": [1.0, 1.5, 2.0],
+            "parameter_s0": [2.0, 1.0, 3.0],
+            "parameter_a": [1.0, 2.0, 0.5],
+            "parameter_b": [2.0, 3.0, 1.0],
+        }
+    )
+    drawn.to_parquet(folder / "population.parquet")
+    lines = export(folder)
+    assert "3 drawn from their population in 'population'" in lines[0]
+    found = types(folder / "drivers.add.xml")["population"]
+    assert [float(kind["tau"]) for kind in found.values()] == [1.0, 1.5, 2.0]
+    assert [float(kind["accel"]) for kind in found.values()] == [1.0, 2.0, 0.5]
+    assert [float(kind["minGap"]) for kind in found.values()] == [2.0, 1.0, 3.0]
+
+
 def test_sumo_loads_it_as_it_is_and_one_vehicle_of_each_type_drives(tmp_path: Path) -> None:
     pytest.importorskip("traci", reason="needs the extra sumo")
     nodes: list[dict[str, Any]] = [
@@ -148,14 +168,20 @@ def test_sumo_loads_it_as_it_is_and_one_vehicle_of_each_type_drives(tmp_path: Pa
     ]
     for number, node in enumerate(nodes):
         folder = job(tmp_path / str(number), node)
+        own = pd.read_csv(folder / "pairs.csv").query("method == 'fixed'")
+        own.filter(regex="^parameter_").to_parquet(folder / "population.parquet")
         export(folder)
-        every = [kind for kinds in types(folder / "drivers.add.xml").values() for kind in kinds]
+        found = types(folder / "drivers.add.xml")
+        new = found.pop("population")
+        every = [kind for kinds in found.values() for kind in kinds]
         vehicles = [
             f'<vehicle id="{kind}" type="{kind}" route="m" depart="{i}"/>'
             for i, kind in enumerate(every)
         ]
         vehicles.append('<vehicle id="any" type="normal" route="m" depart="9"/>')
         vehicles.append('<vehicle id="anybody" type="drivers" route="m" depart="12"/>')
+        vehicles.append('<vehicle id="new" type="population" route="m" depart="15"/>')
+        assert len(new) == len(every)
         (folder / "demand.rou.xml").write_text(
             f'<routes><route id="m" edges="1001"/>{"".join(vehicles)}</routes>'
         )
@@ -196,6 +222,7 @@ print(json.dumps(answers))
             "aggressive_0",
         }
         assert seen["any"][0] in {"normal_0", "normal_1"}
+        assert seen["new"][0].startswith("population_")
         assert all(fastest > 5 for _, fastest in seen.values())
 
 

@@ -29,6 +29,18 @@ from tests.made_up import (
 from tests.report.folders import write_job
 
 
+def _known(results: Results) -> dict[str, float]:
+    known = {"pareto_k": 0.3}
+    for axis in results.parameters:
+        known |= {f"low_{axis.name}": 1.0, f"median_{axis.name}": 2.0, f"high_{axis.name}": 3.0}
+        known[f"contraction_{axis.name}"] = 0.5
+    return known
+
+
+def _drawn(results: Results) -> dict[str, float]:
+    return {f"parameter_{axis.name}": 2.0 for axis in results.parameters}
+
+
 @pytest.fixture(scope="module")
 def everything() -> Results:
     """Results of a job that measured all that figures can show."""
@@ -58,7 +70,8 @@ def everything() -> Results:
         "forecasts": forecasts,
         "distributions": make_distributions(forecasts),
         "slices": slices,
-        "fits": fits.assign(train_rmse_speed=0.3, test_rmse_speed=0.4),
+        "fits": fits.assign(train_rmse_speed=0.3, test_rmse_speed=0.4, **_known(results)),
+        "posterior": fits.assign(draw=0, **_drawn(results)),
         "labels": labels.assign(**{f"parameter_{axis.name}": 1.0}),
     }
     return dataclasses.replace(results, tables={**results.tables, **tables})

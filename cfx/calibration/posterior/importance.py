@@ -1,0 +1,260 @@
+"""Samples from drivers' posteriors by adaptive importance sampling, and how far to trust them.
+
+A mixture of Student's t distributions starts at Laplace's approximation: as wide as that, and as
+wide as the prior. In each round a further one takes mean and covariance of all samples so far, and
+all samples are weighted anew by the density over that of the whole mixture (AMIS). Long tails and
+jumps of the density, as those of W99, are so found out. The largest weights are smoothed by a
+Pareto distribution (PSIS, of ArviZ). Its shape k says whether weighted samples stand in for the
+posterior: they do below 0.7. Drivers for whom they do leave the search, others go on.
+
+J.-M. Cornuet, J.-M. Marin, A. Mira and C. P. Robert (2012), *Adaptive multiple importance
+sampling*, Scandinavian Journal of Statistics 39(4). A. Vehtari, D. Simpson, A. Gelman, Y. Yao and
+J. Gabry (2024), *Pareto smoothed importance sampling*, Journal of Machine Learning Research 25.
+
+Shapes: P drivers, n tuned parameters, d coordinates, N samples of each driver so far, C components.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from arviz_stats.base.array import array_stats
+from torch import Tensor
+
+from cfx.calibration.posterior.density import Posterior
+from cfx.calibration.posterior.laplace import Normal
+from cfx.calibration.posterior.levels import RELIABLE
+
+SAMPLES = 400
+"""Samples of one component."""
+
+DRAWS = 200
+"""Equally weighted draws that are kept of each driver."""
+
+_LEAST_ROUNDS, _MOST_ROUNDS = 2, 25
+_ENOUGH_K, _ENOUGH_SAMPLES = 0.5, 500.0
+"""Pareto k below which, and effective sample size above which, a driver's search ends. Below 0.5
+weights have a variance; 90 % intervals of synthetic IDM drivers who ended between 0.5 and 0.7 held
+the truth for 86 to 87 %, of those below 0.5 for 89 %."""
+
+_FREEDOM = 5.0
+"""Degrees of freedom of the components."""
+
+_WIDER = 1.5
+"""By how much a component's covariance is larger than that of the samples it is made of: a mixture
+that is too wide costs samples, one that is too narrow misses tails."""
+
+
+class Sampled(NamedTuple):
+    """What samples of P drivers' posteriors say.
+
+    Attributes:
+        quantiles: of each parameter's logit, `(P, shares, n)`.
+        draws: equally weighted draws of all coordinates, `(P, DRAWS, d)`.
+        effective: effective sample size that quantiles rest on, `(P,)`.
+        pareto_k: of the weights, `(P,)`; above 0.7 nothing here is reliable.
+    """
+
+    quantiles: Tensor
+    draws: Tensor
+    effective: Tensor
+    pareto_k: Tensor
+
+    @property
+    def reliable(self) -> Tensor:
+        """Whether the samples stand in for the posterior, bool `(P,)`."""
+        return self.pareto_k <= RELIABLE
+
+
+class _Components(NamedTuple):
+    """Student's t distributions: locations `(P, C, d)` and factors of scales `(P, C, d, d)`."""
+
+    location: Tensor
+    factor: Tensor
+
+    def log_density(self, places: Tensor) -> Tensor:
+        """Returns the log of the sum of all densities at places `(P, N, d)`, `(P, N)`."""
+        d = places.shape[-1]
+        whole = math.lgamma((_FREEDOM + d) / 2) - math.lgamma(_FREEDOM / 2)
+        whole -= 0.5 * d * math.log(_FREEDOM * math.pi)
+        found = []
+        for location, factor in zip(self.location.unbind(1), self.factor.unbind(1), strict=True):
+            away = (places - location[:, None]).mT
+            squares = torch.linalg.solve_triangular(factor, away, upper=False).square().sum(-2)
+            size = torch.diagonal(factor, dim1=1, dim2=2).log().sum(-1)[:, None]
+            found.append(whole - size - 0.5 * (_FREEDOM + d) * torch.log1p(squares / _FREEDOM))
+        return torch.stack(found).logsumexp(0)
+
+    def draw(self, generator: torch.Generator) -> Tensor:
+        """Returns `SAMPLES` of each component, `(P, C * SAMPLES, d)`.
+
+        All drivers have the same random numbers, so that a driver's samples depend neither on the
+        others nor on how many are worked on at once.
+        """
+        count, d = self.location.shape[1:]
+        normal = torch.randn((count, SAMPLES, d), generator=generator, dtype=torch.float64)
+        shape = torch.full((count, SAMPLES, 1), _FREEDOM / 2, dtype=torch.float64)
+        squares = 2.0 * torch._standard_gamma(shape, generator=generator)  # noqa: SLF001 - the only one with a generator
+        standard = normal * torch.sqrt(_FREEDOM / squares)
+        return (self.location[:, :, None] + standard @ self.factor.mT).flatten(1, 2)
+
+
+class _Weighted(NamedTuple):
+    """Samples so far.
+
+    Attributes:
+        places: `(P, N, d)`.
+        height: log density of the posterior, `(P, N)`.
+        mixture: log of the sum of the components' densities, `(P, N)`.
+    """
+
+    places: Tensor
+    height: Tensor
+    mixture: Tensor
+
+    def log_weights(self) -> Tensor:
+        """Returns logarithms of weights that sum to 1, `(P, N)`."""
+        return torch.log_softmax(self.height - self.mixture, dim=1)
+
+
+def sample(
+    posterior: Posterior, normal: Normal, shares: Tensor, *, seed: int, memory: int
+) -> Sampled:
+    """Returns samples of each driver's posterior.
+
+    Args:
+        posterior: of P drivers.
+        normal: Laplace's approximation of it.
+        shares: of the quantiles, within (0, 1).
+        seed: the same seed gives the same samples, however much memory there is.
+        memory: bound in bytes for the drivers that are worked on at once.
+    """
+    d = normal.mode.shape[-1]
+    kept = _MOST_ROUNDS * SAMPLES * (d + 4) * torch.float64.itemsize
+    size = max(1, memory // (2 * SAMPLES * posterior.bytes_per_candidate + 4 * kept))
+    parts = []
+    for drivers in torch.split(torch.arange(len(normal.mode)), size):
+        own = Normal(*(values[drivers] for values in normal))
+        parts.append(_sampled(posterior.take(drivers), own, shares, seed))
+    return Sampled(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def _sampled(posterior: Posterior, normal: Normal, shares: Tensor, seed: int) -> Sampled:
+    found: list[tuple[Tensor, Sampled]] = []
+    for drivers, weighted, smoothed, k in _finished(posterior, normal, seed):
+        weights = smoothed.exp()
+        generator = torch.Generator().manual_seed(seed)
+        draws = _resampled(weighted.places, weights, generator)
+        n = len(posterior.space)
+        quantiles = _quantiles(weighted.places[..., :n], weights, shares)
+        found.append((drivers, Sampled(quantiles, draws, _effective(smoothed), k)))
+    order = torch.cat([drivers for drivers, _ in found]).argsort()
+    together = zip(*(part for _, part in found), strict=True)
+    return Sampled(*(torch.cat(values)[order] for values in together))
+
+
+def _finished(
+    posterior: Posterior, normal: Normal, seed: int
+) -> Iterator[tuple[Tensor, _Weighted, Tensor, Tensor]]:
+    """Yields numbers of drivers whose search has ended, samples, log weights and Pareto k."""
+    generator = torch.Generator().manual_seed(seed)
+    left = torch.arange(len(normal.mode))
+    components = new = _first(posterior, normal)
+    samples = None
+    for number in range(1, _MOST_ROUNDS + 1):
+        samples = _further(posterior, samples, components, new, generator)
+        smoothed, k = _smoothed(samples.log_weights())
+        on = (k > _ENOUGH_K) | (_effective(smoothed) < _ENOUGH_SAMPLES)
+        if number < _LEAST_ROUNDS:
+            on[:] = True
+        if number == _MOST_ROUNDS:
+            on[:] = False
+        if not bool(on.all()):
+            ended = ~on
+            yield left[ended], _Weighted(*(v[ended] for v in samples)), smoothed[ended], k[ended]
+            if not bool(on.any()):
+                return
+            left, posterior = left[on], posterior.take(on.nonzero()[:, 0])
+            samples = _Weighted(*(values[on] for values in samples))
+            components = _Components(*(values[on] for values in components))
+            normal = Normal(*(values[on] for values in normal))
+        new = _adapted(samples, normal)
+        together = zip(components, new, strict=True)
+        components = _Components(*(torch.cat(values, dim=1) for values in together))
+
+
+def _first(posterior: Posterior, normal: Normal) -> _Components:
+    """Returns Laplace's approximation, and the same with each parameter as wide as a priori."""
+    n = len(posterior.space)
+    deviation = torch.diagonal(normal.covariance, dim1=1, dim2=2).sqrt()
+    prior = torch.linalg.inv(posterior.prior.precision).diagonal().sqrt()
+    wider = torch.full_like(deviation, _WIDER)
+    wider[:, :n] = (prior / deviation[:, :n]).clamp(min=1.0)
+    factor = torch.linalg.cholesky(normal.covariance)
+    location = normal.mode[:, None].expand(-1, 2, -1)
+    return _Components(location, torch.stack([factor, wider[..., None] * factor], dim=1))
+
+
+def _further(
+    posterior: Posterior,
+    samples: _Weighted | None,
+    components: _Components,
+    new: _Components,
+    generator: torch.Generator,
+) -> _Weighted:
+    """Returns samples with those of the new components, which are among all components."""
+    drawn = new.draw(generator)
+    height, mixture = posterior(drawn), components.log_density(drawn)
+    if samples is None:
+        return _Weighted(drawn, height, mixture)
+    before = torch.logaddexp(samples.mixture, new.log_density(samples.places))
+    return _Weighted(
+        torch.cat([samples.places, drawn], dim=1),
+        torch.cat([samples.height, height], dim=1),
+        torch.cat([before, mixture], dim=1),
+    )
+
+
+def _adapted(samples: _Weighted, normal: Normal) -> _Components:
+    """Returns a component like all samples. Large weights are cut off (Ionides 2008)."""
+    logarithms = samples.log_weights()
+    weights = logarithms.clamp(max=-0.5 * math.log(logarithms.shape[1])).softmax(dim=1)[..., None]
+    location = (weights * samples.places).sum(1)
+    away = samples.places - location[:, None]
+    covariance = _WIDER * ((weights * away).mT @ away) + 1e-3 * normal.covariance
+    return _Components(location[:, None], torch.linalg.cholesky(covariance)[:, None])
+
+
+def _smoothed(log_weights: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns Pareto-smoothed log weights `(P, N)` that sum to 1, and k `(P,)`."""
+    with np.errstate(all="ignore"):  # where a few weights are all there is, k is not a number
+        smoothed, k = array_stats.psislw(-log_weights.numpy())
+    shape = torch.as_tensor(np.nan_to_num(k, nan=np.inf), dtype=torch.float64)
+    return torch.log_softmax(torch.as_tensor(smoothed), dim=1), shape.reshape(len(log_weights))
+
+
+def _effective(log_weights: Tensor) -> Tensor:
+    """Returns the effective sample size (Kish) of log weights `(P, N)`, `(P,)`."""
+    return torch.exp(-torch.logsumexp(2.0 * log_weights, dim=1))
+
+
+def _quantiles(values: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
+    """Returns quantiles `(P, shares, n)` of values `(P, N, n)` with weights `(P, N)`."""
+    ordered, order = values.sort(dim=1)
+    below = weights[..., None].expand_as(values).gather(1, order).cumsum(dim=1).mT.contiguous()
+    wanted = shares.expand(*below.shape[:2], -1).contiguous()
+    place = torch.searchsorted(below, wanted).clamp(max=values.shape[1] - 1)
+    return ordered.gather(1, place.mT)
+
+
+def _resampled(places: Tensor, weights: Tensor, generator: torch.Generator) -> Tensor:
+    """Returns equally weighted draws `(P, DRAWS, d)` in random order (systematic resampling)."""
+    start = torch.rand(1, generator=generator, dtype=torch.float64)
+    wanted = (torch.randperm(DRAWS, generator=generator) + start) / DRAWS
+    place = torch.searchsorted(weights.cumsum(dim=1), wanted.expand(len(places), -1).contiguous())
+    place = place.clamp(max=places.shape[1] - 1)
+    return places.gather(1, place[..., None].expand(-1, -1, places.shape[-1]))

@@ -1,0 +1,187 @@
+"""How well drivers' parameters are known: intervals of all drivers, and one driver's posterior."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from cfx.calibration.posterior.levels import DETERMINED, LEVEL, RELIABLE
+from cfx.figures.canvas import canvas, legend_above, most_across, points, styled, wrapped
+from cfx.figures.figure import JobFigure, ParameterAxis, Results
+from cfx.figures.text import EDGE, INK, colour_of, plural, short, unit_label
+
+_ACROSS = 5
+
+_KINDS = (
+    ("determined", "fixed", 1.0),
+    ("hardly narrower than before the recording", "default", 0.6),
+    ("not to be relied on", "population", 1.0),
+)
+"""Words, whose colour, and opacity of each kind of interval."""
+
+
+def interval_rows(fits: pd.DataFrame) -> pd.DataFrame:
+    """Returns the rows of a job's table `fits` that have intervals."""
+    if "pareto_k" not in fits:
+        return fits.iloc[:0]
+    return fits[(fits["method"] == "fixed") & fits["pareto_k"].notna()]
+
+
+@styled
+def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
+    """Draws each driver's interval of each parameter, in the order of their medians.
+
+    Args:
+        rows: as `interval_rows` returns them, at least one.
+        axes: the tuned parameters.
+    """
+    across = min(most_across(_ACROSS), len(axes))
+    down = -(-len(axes) // across)
+    figure = canvas(1.1 + 2.4 * down)
+    grid = figure.subplots(down, across, squeeze=False)
+    for place, axis in zip(grid.flat, axes, strict=False):
+        _intervals(place, rows, axis)
+    for unused in grid.flat[len(axes) :]:
+        unused.set_visible(False)
+    handles: dict[str, Artist] = {}
+    for place in grid.flat:
+        for handle, text in zip(*place.get_legend_handles_labels(), strict=True):
+            handles.setdefault(text, handle)
+    legend_above(figure, [handles[words] for words, *_ in _KINDS if words in handles])
+    figure.supxlabel(
+        wrapped(f"{plural(len(rows), 'pair')}, in the order of their medians (dots)"),
+        fontsize=points(10.5),
+        color=INK,
+    )
+    return figure
+
+
+def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
+    ordered = rows.sort_values(f"median_{axis.name}")
+    number = np.arange(len(ordered))
+    reliable = ordered["pareto_k"].to_numpy(dtype=float) <= RELIABLE
+    known = ordered[f"contraction_{axis.name}"].to_numpy(dtype=float) >= DETERMINED
+    kinds = (reliable & known, reliable & ~known, ~reliable)
+    low, middle, high = (
+        ordered[f"{kind}_{axis.name}"].to_numpy(dtype=float) for kind in ("low", "median", "high")
+    )
+    size = max(0.8, min(3.0, 120.0 / len(ordered)))
+    for which, (words, method, opacity) in zip(kinds, _KINDS, strict=True):
+        if which.any():
+            place.vlines(
+                number[which],
+                low[which],
+                high[which],
+                color=colour_of(method),
+                alpha=opacity,
+                linewidth=size,
+                label=words,
+            )
+    place.plot(number, middle, ".", color=INK, markersize=2.5)
+    if axis.low is not None and axis.high is not None:
+        for bound in (axis.low, axis.high):
+            place.axhline(bound, color=EDGE, linestyle="--", linewidth=1)
+    place.set_xticks([])
+    share = int((reliable & known).sum())
+    place.set_title(f"{unit_label(axis.name, axis.unit)}: {share} of {len(ordered)}")
+
+
+@styled
+def draw_pairs(pair_id: str, draws: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
+    """Draws a driver's draws of each two parameters, within the bounds.
+
+    Args:
+        pair_id: of the driver's pair.
+        draws: a row per draw, with a column `parameter_NAME` for each parameter.
+        axes: the tuned parameters.
+    """
+    count = len(axes)
+    figure = canvas(1.0 + 1.15 * count, 2.0 + 1.3 * count)
+    grid = figure.subplots(count, count, squeeze=False)
+    for row, vertical in enumerate(axes):
+        for column, horizontal in enumerate(axes):
+            place = grid[row, column]
+            if column > row:
+                place.set_visible(False)
+                continue
+            across = draws[f"parameter_{horizontal.name}"].to_numpy(dtype=float)
+            _limits(place.set_xlim, horizontal)
+            if column == row:
+                place.hist(across, bins=20, color=colour_of("fixed"))
+                place.set_yticks([])
+            else:
+                along = draws[f"parameter_{vertical.name}"].to_numpy(dtype=float)
+                place.plot(across, along, ".", color=colour_of("fixed"), alpha=0.4, markersize=2.5)
+                _limits(place.set_ylim, vertical)
+                place.yaxis.set_major_locator(MaxNLocator(3))
+            place.xaxis.set_major_locator(MaxNLocator(3))
+            place.tick_params(labelsize=points(8))
+            place.label_outer()
+    for number, axis in enumerate(axes):
+        named = unit_label(axis.name, axis.unit)
+        grid[-1, number].set_xlabel(named, fontsize=points(9))
+        grid[number, 0].set_ylabel(named if number else "draws", fontsize=points(9))
+    said = wrapped(f"{short(pair_id)}: {plural(len(draws), 'draw')} from the posterior")
+    figure.supxlabel(said, fontsize=points(10.5), color=INK)
+    return figure
+
+
+def _limits(limit: object, axis: ParameterAxis) -> None:
+    if axis.low is not None and axis.high is not None and callable(limit):
+        limit(axis.low, axis.high)
+
+
+def _middle(rows: pd.DataFrame) -> str:
+    """Returns the pair whose parameters are known as well as those of half of the pairs."""
+    contraction = rows.filter(regex="^contraction_").mean(axis=1)
+    order = contraction.sort_values().index
+    return str(rows.loc[order[len(order) // 2], "pair_id"])
+
+
+class PosteriorIntervals(JobFigure):
+    """Intervals of each parameter of all drivers."""
+
+    title = f"{LEVEL:.0%} intervals of each driver's parameters"
+    caption = (
+        f"What each recording says of its driver's parameters: {LEVEL:.0%} intervals between the"
+        " bounds (dashed). Above each panel: for how many pairs the recording determines the"
+        f" parameter, so that the interval is at least {DETERMINED:.0%} narrower than before."
+    )
+    order = 133
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where the job has a posterior."""
+        fits = results.tables.get("fits")
+        if fits is None:
+            return None
+        rows = interval_rows(fits)
+        axes = [axis for axis in results.parameters if f"median_{axis.name}" in rows]
+        return draw_intervals(rows, axes) if len(rows) and axes else None
+
+
+class PosteriorPairs(JobFigure):
+    """One driver's posterior of each two parameters."""
+
+    title = "The posterior of one driver's parameters"
+    caption = (
+        "Draws from the posterior of the pair whose parameters are known about as well as those of"
+        " half of the pairs. A narrow diagonal band: the recording determines a combination of both"
+        " parameters, but not each."
+    )
+    order = 134
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where the job has a posterior."""
+        fits, draws = results.tables.get("fits"), results.tables.get("posterior")
+        if fits is None or draws is None or interval_rows(fits).empty:
+            return None
+        pair_id = _middle(interval_rows(fits))
+        own = draws[draws["pair_id"].astype(str) == pair_id]
+        axes = [axis for axis in results.parameters if f"parameter_{axis.name}" in own]
+        return draw_pairs(pair_id, own, axes) if len(own) and axes else None
