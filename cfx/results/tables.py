@@ -317,7 +317,7 @@ class PosteriorDraws(ResultTable):
     order = 211
     columns = (
         PAIR,
-        Column("draw", "", "its number within the pair", "int"),
+        Column("draw", "1", "its number within the pair", "int"),
         Column("parameter_NAME", "as of the parameter", "the parameter"),
     )
 
