@@ -8,7 +8,7 @@ import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
 
 import numpy as np
 from rich.console import Console, RenderableType
@@ -24,8 +24,11 @@ from cfx.data.kinematics import in_words
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.plausible import doubts, rare
 from cfx.data.resample import frames_in_steps
-from cfx.data.site_styles import ALL, NOT_KNOWN, style_distances, styles_by_site
+from cfx.data.site_styles import ALL, NOT_KNOWN, styles_by_site
 from cfx.data.style import INDICATORS, STANDING_MPS, StyleResult, name_of_indicator
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 log = logging.getLogger(__name__)
 
@@ -144,13 +147,14 @@ def _site_cells(pairs: Sequence[Pair]) -> Iterator[str]:
         yield f"{middle:.1f} ({low:.1f} to {high:.1f})"
 
 
-def describe_style(style: StyleResult) -> str:
+def describe_style(style: StyleResult, distances: pd.DataFrame | None) -> str:
     """Says how the driving styles of sites differ, and in which indicator.
 
     Args:
         style: of drivers of at least two sites.
+        distances: as `style_distances` returns them.
     """
-    sites, distances = styles_by_site(style), style_distances(style)
+    sites = styles_by_site(style)
     if sites is None:
         return "Driving style: there is one site alone; give the files of several"
     table = Table(

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.data.style import INDICATORS, StyleResult, normalise
+from cfx.data.style import BETWEEN, INDICATORS, StyleResult, normalise
 
 ALL = "all"
 """The drivers of a site whatever drives."""
@@ -21,7 +21,6 @@ ALL = "all"
 NOT_KNOWN = "not known"
 """What stands for a type of driver that the recording does not tell."""
 
-_BETWEEN = "; "
 _FEWEST = 2
 """Drivers of a group that distances are computed for."""
 
@@ -57,7 +56,7 @@ def groups(drivers: pd.DataFrame) -> list[Group]:
     """
     if "site" not in drivers:
         return []
-    at = [str(names).split(_BETWEEN) for names in drivers["site"].fillna("")]
+    at = [str(names).split(BETWEEN) for names in drivers["site"].fillna("")]
     sites = dict.fromkeys(name for names in at for name in names if name)
     kinds = drivers["driver_type"].fillna("").replace("", NOT_KNOWN)
     found = []

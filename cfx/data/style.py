@@ -67,6 +67,10 @@ STANDING_MPS = 0.5
 """Below this speed a vehicle stands: its time headway, headway over speed, says nothing."""
 
 
+BETWEEN = "; "
+"""What stands between the sites of a driver who was recorded at several."""
+
+
 class StyleSettings(Settings):
     """Settings of the driving style, and of which drivers a job uses."""
 
@@ -151,7 +155,7 @@ def _whereabouts(pairs: PairSet, drivers: Sequence[str]) -> tuple[list[str], lis
     for pair in pairs:
         sites.setdefault(pair.driver, {})[pair.site] = None
         kinds[pair.driver] = pair.driver_type
-    return ["; ".join(sites[name]) for name in drivers], [kinds[name] for name in drivers]
+    return [BETWEEN.join(sites[name]) for name in drivers], [kinds[name] for name in drivers]
 
 
 def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:

@@ -12,6 +12,8 @@ from cfx.core.command import Command
 from cfx.core.errors import CfxError, ConfigError, DataError
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from cfx.data.style import StyleResult
 
 
@@ -57,6 +59,7 @@ def _describe(options: argparse.Namespace) -> None:
     """
     from cfx.data.base import joined
     from cfx.data.describe import describe_sites, describe_style, described
+    from cfx.data.site_styles import style_distances
     from cfx.data.sites import with_sites, with_vehicles
     from cfx.data.style import StyleSettings, measure_style
 
@@ -94,24 +97,24 @@ def _describe(options: argparse.Namespace) -> None:
     print(describe_sites(pairs))
     if compares:
         style = measure_style(pairs, StyleSettings())
-        print(f"\n{describe_style(style)}")
+        distances = style_distances(style)
+        print(f"\n{describe_style(style, distances)}")
         if options.figure:
-            _draw(style, Path(options.figure).expanduser())
+            _draw(style, distances, Path(options.figure).expanduser())
 
 
-def _draw(style: StyleResult, path: Path) -> None:
+def _draw(style: StyleResult, distances: pd.DataFrame | None, path: Path) -> None:
     """Draws the driving styles of sites into a file.
 
     Raises:
         ConfigError: its ending is none of a figure.
     """
     from cfx.core.files import atomic_write
-    from cfx.data.site_styles import style_distances
     from cfx.figures.site_styles import draw_site_styles
 
     if path.suffix not in _FIGURES:
         raise ConfigError(f"--figure {path}: its name must end in {', '.join(_FIGURES)}")
-    figure = draw_site_styles(style, style_distances(style))
+    figure = draw_site_styles(style, distances)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:])
     print(f"\nFigure: {path}")
