@@ -219,12 +219,31 @@ def test_recordings_are_told_apart_by_place_and_clock(tmp_path: Path) -> None:
     assert len({pair.driver for pair in pairs}) == 8, (
         "vehicle 2 of one recording is not vehicle 2 of another"
     )
+    assert [pair.site for pair in pairs] == [*["i-80"] * 6, *["us-101"] * 2]
     chosen = NgsimDataset(path=path, location="US-101", min_frames=2).load()
     assert [pair.pair_id for pair in chosen] == ["us-101-2-1", "us-101-3-2"]
     assert counts(chosen)["other locations than 'US-101'"] == 450
     assert len(NgsimDataset(path=path, recording="i-80-2", min_frames=2).load()) == 2
     with pytest.raises(DataError, match=r"no such location. Did you mean 'us-101'\? Known: "):
         NgsimDataset(path=path, location="us101", min_frames=2).load()
+
+
+@pytest.mark.parametrize(
+    ("day", "site"),
+    [
+        ("2005-04-13 16:00", "i-80"),
+        ("2005-04-13 17:29", "i-80"),
+        ("2005-06-15 07:50", "us-101"),
+        ("2005-06-16 08:28", "lankershim"),
+        ("2006-11-08 13:00", "peachtree"),
+        ("2005-04-14 16:00", ""),
+    ],
+)
+def test_without_a_location_the_day_tells_the_site(tmp_path: Path, day: str, site: str) -> None:
+    place = "America/New_York" if site == "peachtree" else "America/Los_Angeles"
+    clock = round(1000 * pd.Timestamp(day, tz=place).timestamp())
+    path = save(traffic(clock), tmp_path / "trajectories.csv")
+    assert {pair.site for pair in read_ngsim(path).pairs()} == {site}
 
 
 def test_recordings_that_overlap_in_time_are_told_apart(tmp_path: Path) -> None:
@@ -385,6 +404,7 @@ def test_raw_sample_has_142_pairs(raw: PairSet) -> None:
     assert counts(raw)["no vehicle ahead"] == 42_566
     assert counts(raw)["the leader is behind its follower (gap of 0 or less)"] == 24
     assert {pair.recording for pair in raw} == {"i80_0400_raw_sample"}
+    assert {pair.site for pair in raw} == {"i-80"}
 
 
 def test_raw_speeds_have_artefacts_for_three_seconds(shared_data: Path) -> None:

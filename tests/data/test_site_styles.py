@@ -104,6 +104,10 @@ def test_describe_compares_the_sites_of_several_files(
         "speed",
     ]
     assert figure.read_bytes().startswith(b"<?xml")
+    assert cli.main(["data", "describe", *names, "--figure", str(tmp_path / "sites.doc")]) == 2
+    refused = capsys.readouterr()
+    assert ".png, .svg, .pdf" in refused.err
+    assert not refused.out, "a figure's ending is checked before a file is read"
     assert cli.main(["data", "describe", names[0], "--style"]) == 2
     assert "one alone" in capsys.readouterr().err
     assert cli.main(["data", "describe", names[0], names[0]]) == 0

@@ -54,7 +54,8 @@ def _describe(options: argparse.Namespace) -> None:
     """Prints what each file holds, and compares their sites if there are several.
 
     Raises:
-        ConfigError: no file is named, or `--style` or `--figure` has nothing to compare.
+        ConfigError: no file is named, `--figure` has another ending than a figure, or it or
+            `--style` has nothing to compare.
         DataError: a file cannot be used; or a pair stands in two of those that are compared.
     """
     from cfx.data.base import joined
@@ -67,6 +68,9 @@ def _describe(options: argparse.Namespace) -> None:
     files = [word for word in options.files if not _is_setting(word)]
     if not files:
         raise ConfigError("cfx data describe: name the file to look at")
+    figure = None if options.figure is None else Path(options.figure).expanduser()
+    if figure is not None and figure.suffix not in _FIGURES:
+        raise ConfigError(f"--figure {figure}: its name must end in {', '.join(_FIGURES)}")
     settings = _settings(overrides) if overrides else None
     own = [word for word in overrides if not word.startswith("data=")]
     words = "".join(f" {shlex.quote(word)}" for word in own)
@@ -76,7 +80,7 @@ def _describe(options: argparse.Namespace) -> None:
         print(description.text, end="\n\n" if len(files) > 1 else "\n")
         if description.pairs is not None and len(description.pairs):
             read.append(description.pairs)
-    compares = options.style or options.figure is not None
+    compares = options.style or figure is not None
     try:
         pairs = joined(read) if read else None
     except DataError as error:  # the files overlap
@@ -99,21 +103,15 @@ def _describe(options: argparse.Namespace) -> None:
         style = measure_style(pairs, StyleSettings())
         distances = style_distances(style)
         print(f"\n{describe_style(style, distances)}")
-        if options.figure:
-            _draw(style, distances, Path(options.figure).expanduser())
+        if figure is not None:
+            _draw(style, distances, figure)
 
 
 def _draw(style: StyleResult, distances: pd.DataFrame | None, path: Path) -> None:
-    """Draws the driving styles of sites into a file.
-
-    Raises:
-        ConfigError: its ending is none of a figure.
-    """
+    """Draws the driving styles of sites into a file."""
     from cfx.core.files import atomic_write
     from cfx.figures.site_styles import draw_site_styles
 
-    if path.suffix not in _FIGURES:
-        raise ConfigError(f"--figure {path}: its name must end in {', '.join(_FIGURES)}")
     figure = draw_site_styles(style, distances)
     with atomic_write(path) as temporary:
         figure.savefig(temporary, format=path.suffix[1:])

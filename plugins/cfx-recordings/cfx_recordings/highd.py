@@ -15,6 +15,7 @@ from cfx import PairSet, Settings
 from cfx.core.errors import DataError
 from cfx.data.base import Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints
+from cfx.data.sites import with_sites
 from cfx.data.table import Column, Layout, Table, read_table
 from cfx.data.tracks import Tracks, extract_pairs
 
@@ -44,7 +45,10 @@ _VEHICLE_COLUMNS = Layout(
 )
 _RECORDING_COLUMNS = Layout(
     "highD's recordings",
-    (Column("frameRate", "1/s", above=0, wrong="is no frame rate"),),
+    (
+        Column("frameRate", "1/s", above=0, wrong="is no frame rate"),
+        Column("locationId", is_name=True, needed=False, may_be_empty=True),
+    ),
 )
 
 _LEFT, _RIGHT = 1, 2
@@ -78,8 +82,9 @@ class HighdDataset(Dataset):
 
     **Labels.** `driver_type` and `leader_driver_type` are the vehicles' `class`: car or truck.
 
-    The recordings are called `highd-XX`. Vehicles are seen for some 14 s only, so pairs are short:
-    `data.time_step=0.1 data.min_frames=150` gives them at 10 Hz, the step of NGSIM.
+    The recordings are called `highd-XX`, and sites `highd-location-N` by the `locationId` of the
+    recording's metadata (six stretches of motorway). Vehicles are seen for some 14 s only, so pairs
+    are short: `data.time_step=0.1 data.min_frames=150` gives them at 10 Hz, the step of NGSIM.
     """
 
     layout = "highD tracks (m, 25 Hz)"
@@ -93,7 +98,9 @@ class HighdDataset(Dataset):
     def read(self) -> PairSet:
         parts = []
         for path in self.settings.files():
-            parts.append(extract_pairs(_tracks(path), max_gap=self.settings.max_gap))
+            about = read_table(_beside(path, _RECORDING_META), _RECORDING_COLUMNS)
+            pairs = extract_pairs(_tracks(path, about), max_gap=self.settings.max_gap)
+            parts.append(with_sites(pairs, _site(about)))
         return joined(parts)
 
 
@@ -106,8 +113,18 @@ class _Vehicles(NamedTuple):
     kinds: tuple[str, ...]
 
 
-def _tracks(path: Path) -> Tracks:
+def _site(about: Table) -> str | None:
+    """Returns the stretch of motorway that a recording's metadata name; None if they do not."""
+    place = about.labels["locationId"].at(0) if "locationId" in about.labels else ""
+    return f"highd-location-{place}" if place else None
+
+
+def _tracks(path: Path, about: Table) -> Tracks:
     """Reads one recording.
+
+    Args:
+        path: of the tracks.
+        about: the recording's metadata.
 
     Raises:
         DataError: a file is missing or does not keep to the layout.
@@ -124,7 +141,6 @@ def _tracks(path: Path) -> Tracks:
     sign = np.where(to_right, 1.0, -1.0)
     speed = sign * numbers["xVelocity"]
     _check(table, speed)
-    about = read_table(_beside(path, _RECORDING_META), _RECORDING_COLUMNS)
     order = np.lexsort((numbers["frame"], numbers["id"]))
     front = np.where(to_right, numbers["x"] + numbers["width"], -numbers["x"])
     return Tracks(

@@ -87,6 +87,17 @@ Within one recording the clock and the frame count agree far better.
 
 _FRAME_MS = 1000 * DT
 
+_RECORDED_ON = {
+    "2005-04-13": "i-80",
+    "2005-06-15": "us-101",
+    "2005-06-16": "lankershim",
+    "2006-11-08": "peachtree",
+}
+"""The day of each location's recordings, local time, and what its `Location` is called."""
+
+_BEHIND_UTC_MS = 7 * 3_600_000.0
+"""From UTC to the local time of California in summer; Atlanta's recordings keep their day."""
+
 _UNITS = {"position": "ft", "speed": "ft/s", "acceleration": "ft/s2", "gap": "ft"}
 _UNITS |= {f"leader_{name}": unit for name, unit in _UNITS.items()}
 """Units of the layout, by `Dataset.units`'s names."""
@@ -129,9 +140,11 @@ class Rows(Tracks):
 
     Attributes:
         rows_read: rows of the file.
+        sites: of each of `recordings`; "" where it is not known.
     """
 
     rows_read: int
+    sites: tuple[str, ...]
 
     def trimmed(self, seconds: float) -> Rows:
         """Leaves out the rows within so many seconds of their vehicle's first or last one."""
@@ -169,7 +182,8 @@ class Rows(Tracks):
 
     def pairs(self) -> PairSet:
         """Cuts the rows into pairs: see `NgsimDataset`."""
-        return extract_pairs(self)
+        site = dict(zip(self.recordings, self.sites, strict=True))
+        return extract_pairs(self).changed(lambda pair: replace(pair, site=site[pair.recording]))
 
     def _since_and_until(self) -> tuple[Ints, Ints]:
         """Returns frames since the first and until the last row of each row's vehicle, `(N,)`."""
@@ -200,12 +214,14 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
             reason = f"other locations than '{location}'"
             dropped.append(Dropped(reason, count - len(row), "rows"))
     columns = {name: values[row] for name, values in numbers.items()}
-    recording, names = _recordings(columns, where.codes[row], where.names)
+    recording, names, places = _recordings(columns, where.codes[row], where.names)
+    if _LOCATION not in table.labels:
+        places = _by_day(columns, recording, len(names))
     order, again = _sorted(table, columns, recording, row)
     if again:
         dropped.append(Dropped("the same row again", again, "rows"))
     ordered = {name: values[order] for name, values in columns.items()}
-    rows = _rows(str(path), names, recording[order], ordered, count, dropped)
+    rows = _rows(str(path), names, places, recording[order], ordered, count, dropped)
     _check_units(rows)
     return rows
 
@@ -213,6 +229,7 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
 def _rows(
     source: str,
     names: tuple[str, ...],
+    sites: tuple[str, ...],
     recording: Ints,
     columns: Mapping[str, Floats],
     count: int,
@@ -234,6 +251,7 @@ def _rows(
         acceleration=columns["v_Acc"] * FOOT,
         length=_lengths(columns["v_Length"], recording, vehicle) * FOOT,
         rows_read=count,
+        sites=sites,
         dropped=tuple(dropped),
     )
 
@@ -251,7 +269,7 @@ def _location_code(table: Table, where: Labels, location: str) -> int:
 
 def _recordings(
     columns: Mapping[str, Floats], location: Ints, names: Sequence[str]
-) -> tuple[Ints, tuple[str, ...]]:
+) -> tuple[Ints, tuple[str, ...], tuple[str, ...]]:
     """Returns the recording of each row and the recordings' names: see `NgsimDataset`.
 
     Args:
@@ -260,7 +278,7 @@ def _recordings(
         names: of the locations.
 
     Returns:
-        An index `(N,)` into the names of recordings, and these names.
+        An index `(N,)` into the names of recordings, these names, and the location of each.
     """
     start = np.zeros(len(location))
     if _CLOCK in columns and _clock_ticks(columns, location):
@@ -283,7 +301,16 @@ def _recordings(
         if counts[code] > 1:
             name = f"{name}-{numbers[code]}"
         recordings.append(name)
-    return recording, tuple(recordings)
+    return recording, tuple(recordings), tuple(names[code] for code in locations.tolist())
+
+
+def _by_day(columns: Mapping[str, Floats], recording: Ints, count: int) -> tuple[str, ...]:
+    """Returns the location of each recording by the day of its clock; "" where no day fits."""
+    if _CLOCK not in columns:
+        return ("",) * count
+    clock = pd.Series(columns[_CLOCK] - _BEHIND_UTC_MS).groupby(recording).median()
+    days = pd.to_datetime(clock, unit="ms", errors="coerce").dt.strftime("%Y-%m-%d")
+    return tuple(days.map(_RECORDED_ON).fillna(""))
 
 
 def _clock_ticks(columns: Mapping[str, Floats], location: Ints) -> bool:
@@ -380,7 +407,9 @@ class NgsimDataset(Dataset):
     even if these overlap in time. They are named `LOCATION-1`, `LOCATION-2` in order of time
     (`LOCATION` if there is one alone; the file's name stands in where there is no `Location`
     column). Without a usable clock (no `Global_Time`, or one that a spreadsheet has rounded) each
-    location counts as one recording.
+    location counts as one recording. The site is the `Location`; without that column, the location
+    that was recorded on the day of `Global_Time` (13 April 2005: i-80; 15 June: us-101; 16 June:
+    lankershim; 8 November 2006: peachtree).
 
     **Several files** hold several recordings, as NGSIM's own downloads do. Where two of them call
     theirs alike, as all three of I-80 are `i-80`, the file's name is put before the recording's.

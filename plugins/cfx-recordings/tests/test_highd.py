@@ -81,6 +81,16 @@ def test_contract(tmp_path: Path) -> None:
     check_contract(HighdDataset(path=path, min_frames=100, max_gap=None))
 
 
+def test_the_metadata_name_the_site(tmp_path: Path) -> None:
+    path = write_highd(tmp_path, made_pairs(1))
+    read = HighdDataset(path=path, min_frames=2, max_gap=None).read()
+    assert {pair.site for pair in read} == {"highd-location-1"}
+    about = tmp_path / "01_recordingMeta.csv"
+    pd.read_csv(about).drop(columns="locationId").to_csv(about, index=False)
+    read = HighdDataset(path=path, min_frames=2, max_gap=None).read()
+    assert {pair.site for pair in read} == {""}
+
+
 def test_both_directions_give_the_trajectories_back(tmp_path: Path) -> None:
     made = made_pairs()
     path = write_highd(tmp_path, made)
