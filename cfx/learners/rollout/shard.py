@@ -86,9 +86,9 @@ _TRAJECTORIES = 3_000
 """Of a shard's gradient step at most. A window costs as much per trajectory with 1,500 of them as
 with 6,000, and a tenth more with 700."""
 
-_WORTH_A_PROCESS = 8_000_000
+_WORTH_A_PROCESS = 3_000_000
 """Simulated windows of all trajectories and gradient steps from which a training is cut: some
-twenty seconds on one core. A process needs ten of them to begin."""
+twenty seconds on one core. A process needs five of them to begin."""
 
 
 @dataclass(frozen=True)
