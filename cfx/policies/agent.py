@@ -99,7 +99,7 @@ class TrainedOn:
         pairs: those that were learned from or calibrated on: `Pair.likeness` and the driver's name.
         quantiles: 5, 50 and 95 % of speed (m/s), acceleration (m/s2) and time gap (s) of the
             drivers; empty if they are not known.
-        expected_error: how errors grew on left-out drivers; None if that was not measured.
+        expected_error: how large errors were on left-out drivers; None if that was not measured.
     """
 
     pairs: Mapping[str, str] = field(default_factory=dict)

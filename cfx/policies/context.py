@@ -59,32 +59,53 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ExpectedError:
-    """Factors on the errors in drivers' pasts that bound 90 % of the errors to come.
+    """What bounds 90 % of the errors of speed to come; None where it is not known.
 
     Attributes:
-        policy: of the policy as it was tested, beside drivers' own parameters if it was so.
-        own: of the drivers' own parameters.
+        policy: factor on the error in a driver's past, of the policy as it was tested, beside
+            drivers' own parameters if it was so.
+        own: the same of the drivers' own parameters.
+        unseen: m/s, for drivers of whom nothing is known: RMSE over full trajectories.
+        unseen_constant: the same of constant parameters, pooled over others.
     """
 
-    policy: float
-    own: float
+    policy: float | None = None
+    own: float | None = None
+    unseen: float | None = None
+    unseen_constant: float | None = None
+
+    def of_unseen_in_words(self) -> str:
+        """Returns what to expect of drivers of whom nothing is known, with a warning; or ""."""
+        if self.unseen is None or self.unseen_constant is None:
+            return ""
+        words = (
+            f"of {LEVEL:.0%} of drivers who were left out of its training the RMSE of speed was"
+            f" below {self.unseen:.2f} m/s (constant parameters: {self.unseen_constant:.2f} m/s)"
+        )
+        if self.unseen > self.unseen_constant:
+            ratio = self.unseen / self.unseen_constant
+            words += (
+                f"; expect {ratio:.1f} times the error of constant parameters: train on recordings"
+                " of such drivers"
+            )
+        return words
 
 
-def growth_bound(growth: Floats, group: NDArray[np.int64]) -> float:
-    """Returns the factor that 90 % of drivers' errors grow by at most.
+def conformal_bound(errors: Floats, group: NDArray[np.int64]) -> float | None:
+    """Returns what 90 % of drivers' errors, or of factors by which they grow, stay below.
 
     Args:
-        growth: error in the test over error in the past, `(D,)`; NaN where it is not known.
+        errors: of each driver, `(D,)`; NaN where it is not known.
         group: the site or fold of each, `(D,)`; each counts once.
 
     Returns:
-        The quantile with the correction for a finite number of drivers; NaN where nine or fewer are
-        known, of whom none is a bound.
+        The quantile with the correction for a finite number of drivers; None where nine or fewer
+        are known, of whom none is a bound.
     """
-    known = np.isfinite(growth)
-    growth, group = growth[known], group[known]
-    if math.ceil(LEVEL * (len(growth) + 1)) > len(growth):
-        return math.nan
+    known = np.isfinite(errors)
+    errors, group = errors[known], group[known]
+    if math.ceil(LEVEL * (len(errors) + 1)) > len(errors):
+        return None
     _, number, size = np.unique(group, return_inverse=True, return_counts=True)
-    level = LEVEL * (1.0 + 1.0 / len(growth))
-    return float(np.quantile(growth, level, method="inverted_cdf", weights=1.0 / size[number]))
+    level = LEVEL * (1.0 + 1.0 / len(errors))
+    return float(np.quantile(errors, level, method="inverted_cdf", weights=1.0 / size[number]))

@@ -18,11 +18,12 @@ from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.folds import Together, assign_folds, describe_folds, learned_from
 from cfx.evaluation.protocols.held_out import HeldOut
-from cfx.evaluation.protocols.past import expected_error
+from cfx.evaluation.protocols.past import expected_error, expected_of_unseen
 from cfx.evaluation.result import Evaluation
+from cfx.evaluation.tables import values_of
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.policies.agent import Agent
-from cfx.policies.context import ContextRule
+from cfx.policies.context import ContextRule, ExpectedError
 from cfx.policies.heads.offset import shrunk
 from cfx.policies.placement import ALL
 
@@ -130,9 +131,13 @@ class Trained:
     def policy_after(self, evaluation: Evaluation) -> Agent:
         """Returns the policy, which knows of its test what error to expect of it."""
         policy = self.test.policy
-        if self.fold is None or "past" not in evaluation.tables:
+        if self.fold is None or not policy.policy.trainable:
             return policy
-        expected = expected_error(evaluation.tables["past"], self.fold.cpu().numpy())
+        expected, fold = ExpectedError(), self.fold.cpu().numpy()
+        if "past" in evaluation.tables:
+            expected = expected_error(evaluation.tables["past"], fold)
+        speed = values_of(evaluation.values, "rmse_speed", "full_trajectory")
+        expected = expected_of_unseen(speed, fold, expected)
         return replace(policy, trained_on=replace(policy.trained_on, expected_error=expected))
 
 

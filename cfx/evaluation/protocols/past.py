@@ -20,7 +20,7 @@ Shapes: D drivers, K + 1 frames, n tuned parameters.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -34,7 +34,7 @@ from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.result import Array
 from cfx.evaluation.shards import simulate_in_shards
 from cfx.policies.agent import Agent
-from cfx.policies.context import ExpectedError, growth_bound
+from cfx.policies.context import ExpectedError, conformal_bound
 from cfx.policies.fixed import FixedPolicy
 
 EARLIER = 0.6
@@ -152,8 +152,27 @@ def expected_error(table: pd.DataFrame, fold: NDArray[np.int64]) -> ExpectedErro
     for method in ("policy", "fixed"):
         past = table[f"past_rmse_speed_{method}"]
         growth = table[f"rmse_speed_{method}"] / past.where(past > 0)
-        factors.append(growth_bound(growth.to_numpy(dtype=np.float64), fold))
+        factors.append(conformal_bound(growth.to_numpy(dtype=np.float64), fold))
     return ExpectedError(*factors)
+
+
+def expected_of_unseen(
+    speed: pd.DataFrame, fold: NDArray[np.int64], found: ExpectedError
+) -> ExpectedError:
+    """Adds what bounds the errors of drivers of whom nothing is known.
+
+    Args:
+        speed: RMSE of speed over full trajectories, m/s: a row per driver, a column per method.
+        fold: in which fold each was tested, `(D,)`; each fold counts once.
+        found: what their pasts say.
+    """
+    if not {"policy", "population"} <= set(speed):
+        return found
+    policy, constant = (
+        conformal_bound(speed[method].to_numpy(dtype=np.float64), fold)
+        for method in ("policy", "population")
+    )
+    return replace(found, unseen=policy, unseen_constant=constant)
 
 
 def with_bounds(table: pd.DataFrame, expected: ExpectedError | None) -> pd.DataFrame:
@@ -163,11 +182,12 @@ def with_bounds(table: pd.DataFrame, expected: ExpectedError | None) -> pd.DataF
         table: as of `expected_error`.
         expected: of the policy; None: it is not known.
     """
-    policy, own = (math.nan, math.nan) if expected is None else (expected.policy, expected.own)
-    return table.assign(
-        bound_policy=policy * table["past_rmse_speed_policy"],
-        bound_fixed=own * table["past_rmse_speed_fixed"],
-    )
+    expected = expected or ExpectedError()
+    bounds = {}
+    for method, factor in (("policy", expected.policy), ("fixed", expected.own)):
+        times = math.nan if factor is None else factor
+        bounds[f"bound_{method}"] = times * table[f"past_rmse_speed_{method}"]
+    return table.assign(**bounds)
 
 
 def with_bounds_of_other_folds(table: pd.DataFrame, fold: NDArray[np.int64]) -> pd.DataFrame:

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from cfx.core.errors import ConfigError, DataError, nearest
 from cfx.core.files import atomic_write, path_override, write_json
 from cfx.policies.agent import Agent
 from cfx.policies.checkpoint import load, save
+from cfx.policies.context import ExpectedError
 from cfx.policies.ready import FOLDER
 from cfx.policies.valid_range import FADED, SIGNALS
 from cfx_benchmark.recipes import I80, RECIPES
@@ -154,6 +156,7 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
             "last_part_rmse_speed": metrics["rmse_speed/policy"],
             "last_part_improvement_over_own": metrics["rmse_improvement/mean"],
         },
+        "expected_error": _expected(agent),
         "distributions": _distributions(metrics),
         "safety": {
             "collisions": metrics["full_trajectory/collisions/policy"],
@@ -196,6 +199,12 @@ def _sites(table: pd.DataFrame) -> list[dict[str, Any]]:
                 known[name] = value
         rows.append(known)
     return rows
+
+
+def _expected(agent: Agent) -> dict[str, float | None]:
+    """Returns what bounds the errors of nine in ten drivers, as far as known."""
+    expected = agent.trained_on.expected_error
+    return {} if expected is None else asdict(expected)
 
 
 def _distributions(metrics: dict[str, Any]) -> list[dict[str, float]]:
@@ -286,6 +295,7 @@ def card_text(card: dict[str, Any]) -> str:
         f"- **Safety in these tests**: {safety['collisions']:.0f} collisions,"
         f" {safety['hard_braking_frames']:.0f} frames braking harder than 8 m/s2, RMS jerk"
         f" {safety['jerk']:.2f} m/s3 (the recorded drivers: {safety['jerk_of_people']:.2f})",
+        *_expected_lines(card.get("expected_error", {})),
         *_distribution_lines(card.get("distributions", ())),
         *_stress_lines(card["stress"]),
         f"- **Limits**: {_pairs(card['limits'])}",
@@ -302,6 +312,11 @@ def card_text(card: dict[str, Any]) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _expected_lines(expected: dict[str, float | None]) -> list[str]:
+    words = ExpectedError(**expected).of_unseen_in_words()
+    return [f"- **Expected error**: {words}"] if words else []
 
 
 def _distribution_lines(rows: Sequence[dict[str, float]]) -> list[str]:

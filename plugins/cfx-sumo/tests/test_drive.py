@@ -330,6 +330,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         changed={"calm": 0.5},
         outside={"calm": "3 % of steps outside what the policy has learned (speed above 18 m/s)"},
         recorded={"calm": recorded},
+        expected={"calm": "RMSE of speed below 1.20 m/s"},
         collisions=[
             Collision(3.1, "calm", "a", "b", "road_0", 51.26, -0.2),
             Collision(4.0, "calm", "b", "x", "road_0", 80.0, 2.391),
@@ -344,6 +345,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
     assert rows[3][0] == "calm:"
     assert "3.10 s: a behind b on road_0 at 51.3 m: contact, gap -0.20 m" in out
     assert "4.00 s: b behind x on road_0 at 80.0 m: below minGap, gap 2.39 m" in out
+    assert "calm: RMSE of speed below 1.20 m/s" in out
     assert "calm: 3 % of steps outside what the policy has learned (speed above 18 m/s)" in out
     assert next(line.split() for line in out.splitlines() if "its recording" in line)[2:5] == [
         "1.00,",

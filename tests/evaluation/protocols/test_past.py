@@ -20,7 +20,7 @@ from cfx.data.tidy import TidyDataset
 from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
 from cfx.evaluation.result import Array
 from cfx.policies.checkpoint import load
-from cfx.policies.context import growth_bound
+from cfx.policies.context import ExpectedError, conformal_bound
 from cfx.policies.ready import folder_of_ready_made
 from cfx.results.table import Findings
 from cfx.results.tables import Past
@@ -71,7 +71,7 @@ def test_a_bound_holds_for_nine_in_ten_new_drivers() -> None:
     below = []
     for _ in range(400):
         growth = np.exp(generator.normal(size=51))
-        bound = growth_bound(growth[:50], np.zeros(50, dtype=np.int64))
+        bound = conformal_bound(growth[:50], np.zeros(50, dtype=np.int64))
         below.append(growth[50] <= bound)
     assert 0.86 < np.mean(below) < 0.95
 
@@ -79,11 +79,20 @@ def test_a_bound_holds_for_nine_in_ten_new_drivers() -> None:
 def test_each_fold_counts_once_and_few_drivers_bound_nothing() -> None:
     growth = np.concatenate([np.full(90, 1.0), np.full(10, 3.0)])
     fold = np.repeat([0, 1], [90, 10])
-    assert growth_bound(growth, fold) == 3.0
-    assert growth_bound(growth, np.zeros(100, dtype=np.int64)) == 3.0
-    assert growth_bound(growth[:92], np.zeros(92, dtype=np.int64)) == 1.0
-    assert np.isnan(growth_bound(np.ones(8), np.zeros(8, dtype=np.int64)))
-    assert growth_bound(np.array([*np.ones(9), np.nan]), np.zeros(10, dtype=np.int64)) == 1.0
+    assert conformal_bound(growth, fold) == 3.0
+    assert conformal_bound(growth, np.zeros(100, dtype=np.int64)) == 3.0
+    assert conformal_bound(growth[:92], np.zeros(92, dtype=np.int64)) == 1.0
+    assert conformal_bound(np.ones(8), np.zeros(8, dtype=np.int64)) is None
+    assert conformal_bound(np.array([*np.ones(9), np.nan]), np.zeros(10, dtype=np.int64)) == 1.0
+
+
+def test_larger_errors_than_those_of_constants_are_warned_of() -> None:
+    assert ExpectedError(policy=2.0, own=2.0).of_unseen_in_words() == ""
+    better = ExpectedError(unseen=1.2, unseen_constant=1.5).of_unseen_in_words()
+    assert "below 1.20 m/s (constant parameters: 1.50 m/s)" in better
+    assert "expect" not in better
+    worse = ExpectedError(unseen=3.0, unseen_constant=1.5).of_unseen_in_words()
+    assert "expect 2.0 times the error of constant parameters: train" in worse
 
 
 def test_bounds_know_nothing_of_the_driver_that_they_are_for() -> None:
@@ -116,6 +125,9 @@ def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) ->
     assert expected is not None
     growth = past["rmse_speed_policy"] / past["past_rmse_speed_policy"]
     assert expected.policy == pytest.approx(growth.max())
+    full = learned.pairs.groupby("method")["full_trajectory_rmse_speed"].max()
+    assert expected.unseen == pytest.approx(full["policy"])
+    assert expected.unseen_constant == pytest.approx(full["population"])
     other = tmp_path / "other"
     cfx.run(
         [

@@ -173,6 +173,8 @@ class ScenarioRun:
             "" where nothing was.
         recorded: for each vType, quantiles of the recording that its policy learned from, by
             signal (`Agent.recorded`).
+        expected: for each vType, what error of speed to expect of its policy, in words; "" where
+            that is not known.
         collisions: that SUMO reported of driven vehicles, in their order.
     """
 
@@ -186,6 +188,7 @@ class ScenarioRun:
     changed: Mapping[str, float] = field(default_factory=dict)
     outside: Mapping[str, str] = field(default_factory=dict)
     recorded: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)
+    expected: Mapping[str, str] = field(default_factory=dict)
     collisions: Sequence[Collision] = ()
 
     @property
@@ -502,12 +505,15 @@ class _Run:
                 self._tallies[collision.kind].collisions += 1
             else:
                 self._tallies[collision.kind].below_min_gap += 1
-        limited, changed, outside, recorded = {}, {}, {}, {}
+        limited, changed, outside, recorded, expected = {}, {}, {}, {}, {}
         for name, driver in self._fleet.drivers.items():
             limited[name] = driver.counts.limited / max(1, driver.counts.steps)
             changed[name] = driver.counts.changed / max(1, driver.counts.told)
             outside[name] = driver.outside_in_words()
-            recorded[name] = driver.policy.trained_on.quantiles
+            trained_on = driver.policy.trained_on
+            recorded[name] = trained_on.quantiles
+            error = trained_on.expected_error
+            expected[name] = "" if error is None else error.of_unseen_in_words()
         return ScenarioRun(
             self._tallies,
             self._steps,
@@ -519,6 +525,7 @@ class _Run:
             changed,
             outside,
             recorded,
+            expected,
             self._collisions,
         )
 
@@ -735,6 +742,9 @@ def report(run: ScenarioRun) -> None:
             "SUMO takes a gap below minGap for a collision, and teleports the vehicle unless the"
             " scenario says otherwise; -- --collision.mingap-factor 0 leaves contact alone"
         )
+    for name, words in run.expected.items():
+        if words:
+            print(f"{name}: {words}")
     for name, words in run.outside.items():
         if words:
             print(f"{name}: {words}; there it fades towards its base parameters")
