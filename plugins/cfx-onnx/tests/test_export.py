@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,8 @@ from cfx_onnx.export import OnnxExport
 from cfx_onnx.graph import graph_of
 from tests.agents import adaptive
 
-PLATOON = Path(__file__).resolve().parents[1] / "examples" / "platoon.py"
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+PLATOON = EXAMPLES / "platoon.py"
 
 
 def driven(step: DriverStep) -> NDArray[np.float64]:
@@ -85,6 +88,28 @@ def test_a_stochastic_driver_drives_the_example_as_cfx_does(
         assert f"| `{tensor.name}` |" in card
         assert tensor.type.tensor_type.shape.dim[0].dim_param == "drivers"
     assert "float (drivers, 256) | what the network remembers [1]" in card
+
+
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler, g++")
+def test_the_example_in_cpp_drives_as_cfx_does(tmp_path: Path) -> None:
+    found = find_spec("openvino")
+    if found is None or found.origin is None:
+        pytest.skip("needs OpenVINO: pip install openvino")
+    openvino = Path(found.origin).parent
+    (library,) = (openvino / "libs").glob("libopenvino.so.*")
+    program = tmp_path / "platoon"
+    headers, libraries = f"-I{openvino / 'include'}", f"-Wl,-rpath,{library.parent}"
+    source = EXAMPLES / "cpp" / "platoon.cpp"
+    build = ["g++", "-std=c++17", source, headers, library, libraries, "-o", program]
+    subprocess.run(build, check=True)
+    path = tmp_path / "driver.onnx"
+    assert main(["export", "cfx://i80-idm", "--to", "onnx", "--output", str(path)]) == 0
+    done = subprocess.run([program, path], capture_output=True, text=True, check=True)
+    speeds = np.array([line.split(",") for line in done.stdout.split()], dtype=float)[:, 1:]
+    difference = np.abs(speeds - driven(DriverStep(load(folder_of("cfx://i80-idm") / "policy"))))
+    assert difference[:, :2].max() < 1e-5
+    # Rounding in single precision multiplies from vehicle to vehicle.
+    assert difference.max() < 1e-3
 
 
 def test_one_of_several_networks_is_named(tmp_path: Path) -> None:
