@@ -114,7 +114,8 @@ class RolloutInputs:
     Positions are relative to the follower's at the start of its trajectory.
 
     Attributes:
-        leader: position, speed, acceleration, window by window, `(3, H, N, D, L + S)`, SI units.
+        leader: position, speed, acceleration, window by window, `(3, H, N, D, L + S)`, SI units;
+            frame by frame in memory, those of two windows once.
         leader_length: `(N, D)`, m.
         follower: position, speed, acceleration of the last L frames before the policy takes over,
             `(3, N, D, L)`, SI units.
@@ -144,49 +145,48 @@ class RolloutInputs:
             windows: H.
         """
         length, stride, device = step.length, step.stride, pair.device
-        now = (batch.start * stride)[..., None]
+        now, each = (batch.start * stride)[..., None], pair[..., None]
         past = now + torch.arange(1 - length, 1, device=device)
-        window_starts = torch.arange(windows, device=device)[:, None] * stride
-        offsets = window_starts + torch.arange(1 - length, stride + 1, device=device)
-        around = now + offsets[:, None, None]
+        frames = torch.arange(1 - length, windows * stride + 1, device=device)
+        around = now[..., 0] + frames[:, None, None]
         simulated = now + torch.arange(1, windows * stride + 1, device=device)
-        origin = _at(pairs.follower_position, pair, now)
+        origin = _at(pairs.follower_position, each, now)
         follower = torch.stack(
             [
-                _at(pairs.follower_position, pair, past) - origin,
-                _at(pairs.follower_speed, pair, past),
-                _at(pairs.follower_acceleration, pair, past),
+                _at(pairs.follower_position, each, past) - origin,
+                _at(pairs.follower_speed, each, past),
+                _at(pairs.follower_acceleration, each, past),
             ]
         )
         leader = torch.stack(
             [
-                _at(pairs.leader_position, pair, around) - origin,
+                _at(pairs.leader_position, pair, around) - origin[..., 0],
                 _at(pairs.leader_speed, pair, around),
                 _at(pairs.leader_acceleration, pair, around),
             ]
         )
-        speed = _at(pairs.follower_speed, pair, simulated)
-        gap = _at(pairs.gap, pair, simulated)
+        speed = _at(pairs.follower_speed, each, simulated)
+        gap = _at(pairs.gap, each, simulated)
         leader_length = pairs.leader_length[pair]
         if batch.scale is not None:
             scale = batch.scale[..., None]
             follower, speed, gap = follower * scale, speed * scale, gap * scale
             # The gap is scaled, the vehicle's length is not.
-            zero = torch.zeros_like(scale)
-            rear = torch.stack([leader_length[..., None], zero, zero])[:, None]
-            leader = (leader - rear) * scale + rear
+            zero = torch.zeros_like(leader_length)
+            rear = torch.stack([leader_length, zero, zero])[:, None]
+            leader = (leader - rear) * batch.scale + rear
         if batch.shift is not None and batch.wider is not None:
             shift, wider = batch.shift[..., None], batch.wider[..., None]
-            zero = torch.zeros_like(shift)
             before = (past - now) * step.dt
-            follower = follower + torch.stack(_moved(shift, before, zero))
-            after = (around - now) * step.dt
-            leader = leader + torch.stack(_moved(shift, after, wider))
+            follower = follower + torch.stack(_moved(shift, before, torch.zeros_like(shift)))
+            after = frames[:, None, None] * step.dt
+            leader = leader + torch.stack(_moved(batch.shift, after, batch.wider))
             speed, gap = speed + shift, gap + wider
         counted = (simulated <= batch.last[..., None]).to(follower.dtype)
         memory = step.model.initial_memory(follower[1, ..., -1])
         latent = memory.new_zeros((*pair.shape, step.core.head.latent_width))
         measured = Measured(speed, gap, counted)
+        leader = leader.unfold(1, length + stride, stride)
         return cls(leader, leader_length, follower, memory, latent, measured)
 
     def initial(self, state: Tensor) -> LoopState:
@@ -215,7 +215,7 @@ class RolloutInputs:
 
     def leader_window(self, window: int) -> LeaderWindow:
         """Returns the leader around a window."""
-        position, speed, acceleration = self.leader[:, window].unbind(0)
+        position, speed, acceleration = self.leader[:, window].contiguous().unbind(0)
         return LeaderWindow(position, speed, acceleration)
 
 
@@ -230,11 +230,11 @@ def _at(signal: Tensor, pair: Tensor, frames: Tensor) -> Tensor:
 
     Args:
         signal: of all pairs.
-        pair: `(N, D)`.
-        frames: `(*dims, N, D, K)`.
+        pair: of each frame, of a shape to which it is broadcast.
+        frames: numbers.
     """
     end = signal.shape[1] - 1
-    return signal[pair[..., None], frames.clamp(min=0, max=end)]
+    return signal[pair, frames.clamp(min=0, max=end)]
 
 
 def _with_gradient(value: Tensor) -> Tensor:

@@ -260,7 +260,9 @@ def _scanned(
     inputs = RolloutInputs.of(pairs, conditioning.pair, batch, step, windows)
     tokens, present = observed_windows(dataset, batch, conditioning, most)
     known = conditioning.features.expand(len(tokens), -1, -1, -1)
-    observed = Observed(torch.cat([tokens, known], -1), present.to(tokens.dtype))
+    features = torch.cat([tokens, known], -1)
+    features.sub_(step.core.scaler.mean[:, None]).div_(step.core.scaler.scale[:, None])
+    observed = Observed(features, present.to(tokens.dtype))
     first = 0
     for speed, gap in scan.simulate(inputs, observed, conditioning, windows, path):
         measured = inputs.measured_at(slice(first, first + speed.shape[-1]))

@@ -3,8 +3,9 @@
 A trajectory is one function for autograd: networks observe what was measured before, then they
 drive. Within, gradients are computed by hand, window by window. What is elementwise (features, a
 recurrent cell, the steps of a window) is code recorded from its one definition
-(`cfx.simulation.kernel.elementwise`); the rest are matrix products, those for gradients of weights
-of several windows at once.
+(`cfx.simulation.kernel.elementwise`); the rest are matrix products. No Python runs between windows
+(`cfx.simulation.kernel.sequence`); only gradients by weights are products of all windows at once.
+Threads take some of the networks each, which changes no bit.
 
 Shapes: N networks, D trajectories of each, B windows that are observed, H windows that are driven,
 L frames of a token, S steps of a window, F features that networks read, n answers, h hidden units,
@@ -14,7 +15,6 @@ c numbers that a layer carries (h, or 2 h), G = gates h, M = 3 L + width of the 
 from __future__ import annotations
 
 import copy
-import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -22,6 +22,7 @@ import torch
 from torch import Tensor
 
 from cfx.core.memory import keep_freed_memory
+from cfx.core.threads import cores, share
 from cfx.learners.rollout.dataset import Conditioning
 from cfx.learners.rollout.inputs import RolloutInputs
 from cfx.learners.rollout.window import (
@@ -36,9 +37,7 @@ from cfx.policies.features import token_width
 from cfx.policies.recurrent import RecurrentLayer, RecurrentNetwork
 from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.kernel.elementwise import Elementwise
-
-_TOGETHER = 10
-"""Windows whose gradients by weights are one product; more would take more memory."""
+from cfx.simulation.kernel.sequence import Calls, Operand
 
 _REMEMBERED = 10
 """Observed windows through which gradients go back, as they go back through a similar number of
@@ -50,7 +49,7 @@ class Observed(NamedTuple):
     """What networks observe before they drive.
 
     Attributes:
-        features: not normalised, `(B, N, D, F)`.
+        features: normalised, `(B, N, D, F)`.
         present: 1 where a trajectory has this window, else 0, `(B, N, D)`.
     """
 
@@ -79,6 +78,7 @@ class _Part:
         widths: Mapping[str, int],
         wanted: Sequence[str],
         key: object,
+        **options: int,
     ) -> None:
         self.names = [name for name, width in widths.items() if width > 0]
         numbers = [self.names.index(name) for name in wanted if name in self.names]
@@ -89,17 +89,24 @@ class _Part:
             return function(known)
 
         used = [widths[name] for name in self.names]
-        self.compiled = Elementwise(of_values, used, numbers, key)
+        self.compiled = Elementwise(of_values, used, numbers, key, **options)
 
-    def forward(self, given: Mapping[str, Tensor], *to: Tensor) -> None:
-        """Computes the part of tensors `(A, B, C, width)`; writes its results."""
-        self.compiled.forward([given[name] for name in self.names], *to)
+    def forward(self, calls: Calls, given: Mapping[str, Operand], to: Sequence[Operand]) -> None:
+        """Adds the call that computes the part and writes its results."""
+        calls.elementwise(self.compiled.call_forward, [*self._of(given), *to])
 
     def backward(
-        self, given: Mapping[str, Tensor], gradients: Sequence[Tensor | None], *to: Tensor
+        self,
+        calls: Calls,
+        given: Mapping[str, Operand],
+        gradients: Sequence[Operand],
+        to: Sequence[Operand],
     ) -> None:
-        """Writes the gradients by the wanted arguments."""
-        self.compiled.backward([given[name] for name in self.names], gradients, *to)
+        """Adds the call that writes the gradients by the wanted arguments."""
+        calls.elementwise(self.compiled.call_backward, [*self._of(given), *gradients, *to])
+
+    def _of(self, given: Mapping[str, Operand]) -> list[Operand]:
+        return [given[name] for name in self.names]
 
 
 class Scan:
@@ -138,7 +145,9 @@ class Scan:
         self.drive = _Part(self._moved, moved, wanted, [key, "drive", temperature is None])
         gates = {"projected": network.gates, "recurrent": network.gates, "carried": network.states}
         more = {"input_bias": network.gates, "hidden_bias": network.gates, "present": 1}
-        self.cell = _Part(self._cell, gates | more, list(gates), [key, "cell"])
+        self.cell = _Part(
+            self._cell, gates | more, list(gates), [key, "cell"], together=network.hidden
+        )
 
     def simulate(
         self,
@@ -263,27 +272,10 @@ class _Known(NamedTuple):
         return cls(observed, leader, length, conditioning.features, conditioning.base)
 
 
-class _Cell(NamedTuple):
-    """What a layer's cell reads and writes.
-
-    Attributes:
-        projected, recurrent: of each slot, `(slots, N, D, h, gates)`.
-        carried: `(N, slots, D, h, c / h)`.
-        observing, acting, hidden_bias: biases, `(N, D, h, gates)`.
-    """
-
-    projected: Tensor
-    recurrent: Tensor
-    carried: Tensor
-    observing: Tensor
-    acting: Tensor
-    hidden_bias: Tensor
-
-
 class _Loop:
     """Some windows in a row: B that are observed, then H that are driven, and what they leave.
 
-    Where gradients are recorded every window is kept, else two.
+    Where gradients are recorded every window is kept, else as few as there must be.
     """
 
     def __init__(self, scan: Scan, known: _Known, stand: Stand, path: GradientPath) -> None:
@@ -291,163 +283,163 @@ class _Loop:
         network, step = scan.network, scan.step
         self.observed, self.driven = len(known.observed.present), known.leader.shape[1]
         self.windows = self.observed + self.driven
-        self.keeps = torch.is_grad_enabled()
         self.shape = networks, trajectories = known.leader_length.shape
         new = stand.motion.new_empty
-        self.slots = self.windows + 1 if self.keeps else 2
-        moved = self.driven + 1 if self.keeps else 2
+        windows, driven = self.windows, self.driven
+        slots, moved = windows + 1, driven + 1
+        if not torch.is_grad_enabled():
+            windows, driven, slots, moved = 1, 1, 2, 2
         self.motion = new((moved, len(stand.motion), networks, trajectories))
         self.motion[0] = stand.motion
-        features = scan.step.core.scaler.mean.shape[-1]
-        self.read = new((networks, self.slots, trajectories, features))
+        self.read = new((networks, driven, trajectories, scan.step.core.scaler.mean.shape[-1]))
         gates = network.gates * network.hidden
         self.carried, self.projected, self.recurrent = [], [], []
         for before in stand.carried:
-            kept = new((networks, self.slots, trajectories, before.shape[-1]))
+            kept = new((networks, slots, trajectories, before.shape[-1]))
             kept[:, 0] = before
             self.carried.append(kept)
-            self.projected.append(new((self.slots, networks, trajectories, gates)))
-            self.recurrent.append(new((self.slots, networks, trajectories, gates)))
-        self.logits = new((self.slots, networks, trajectories, step.core.head.answers))
-        frames = self.driven * step.stride
-        self.speed = new((networks, trajectories, frames))
-        self.gap = new((networks, trajectories, frames))
-        self._views(stand.motion.new_ones(()))
+            self.projected.append(new((networks, windows, trajectories, gates)))
+            self.recurrent.append(new((networks, windows, trajectories, gates)))
+        self.logits = new((networks, driven, trajectories, step.core.head.answers))
+        self.speed = new((networks, trajectories, self.driven * step.stride))
+        self.gap = torch.empty_like(self.speed)
+        self.layers = [layer for layer in network.layers if isinstance(layer, RecurrentLayer)]
+        self.outputs = slice(network.hidden)
+        self.around = self._around() if self.driven > 0 else {}
 
-    def _views(self, one: Tensor) -> None:
-        """Arranges what all windows share as the compiled parts read it."""
-        known, scan, network = self.known, self.scan, self.scan.network
+    def _around(self) -> dict[str, Operand]:
+        """Returns all that the features and the steps of a window depend on."""
+        known, scan = self.known, self.scan
         scaler, everywhere = scan.step.core.scaler, (self.shape[0], 1, self.shape[1], -1)
-        self.shared = {
+        shared = {
             "leader_length": known.leader_length[:, None, :, None],
             "conditioning": known.conditioning[:, None],
             "base": known.base[:, None],
             "mean": scaler.mean[:, None, None].expand(everywhere),
             "scale": scaler.scale[:, None, None].expand(everywhere),
-            "bias": network.b_out.detach()[:, None].expand(everywhere),
+            "bias": scan.network.b_out.detach()[:, None].expand(everywhere),
         }
         if scan.temperature is not None:
-            self.shared["temperature"] = scan.temperature.expand(everywhere[:-1]).unsqueeze(-1)
-        self.leader = known.leader.unsqueeze(3).unbind(0)
+            shared["temperature"] = scan.temperature.expand(everywhere[:-1]).unsqueeze(-1)
+        around = {name: Operand(value) for name, value in shared.items()}
+        names = ("leader_position", "leader_speed", "leader_acceleration")
+        for name, signal in zip(names, known.leader, strict=True):
+            around[name] = Operand.over(signal.unsqueeze(2), -self.observed)
+        around["logits"] = self.in_driven(self.logits)
+        return around | self.columns(self.motion, -self.observed)
+
+    def columns(self, motion: Tensor, offset: int) -> dict[str, Operand]:
+        """Returns motion `(slots, M, N, D)` by name."""
+        length = self.scan.step.length
+        whole = Operand.over(motion.permute(0, 2, 3, 1).unsqueeze(2), offset)
+        names = ("position", "speed", "acceleration")
+        found = {
+            name: whole.only(slice(k * length, (k + 1) * length)) for k, name in enumerate(names)
+        }
+        if motion.shape[1] > 3 * length:
+            found["memory"] = whole.only(slice(3 * length, None))
+        return found
+
+    def frames(self, values: Tensor) -> Operand:
+        """Returns the frames of a window, of values `(N, D, frames)`."""
+        each = torch.unflatten(values, -1, (self.driven, self.scan.step.stride))
+        return Operand.over(each.permute(2, 0, 1, 3).unsqueeze(2), -self.observed)
+
+    def in_driven(self, values: Tensor) -> Operand:
+        """Returns values `(N, H, D, width)` of a driven window."""
+        return _rows(values, -self.observed)
+
+    def output(self, number: int) -> Operand:
+        """Returns the output of a layer in a window."""
+        return _rows(self.carried[number], 1).only(self.outputs)
+
+    def seen(self, number: int, *, acts: bool) -> Operand:
+        """Returns what a layer reads in a window."""
+        if number > 0:
+            return self.output(number - 1)
+        if acts:
+            return self.in_driven(self.read)
+        return Operand.over(self.known.observed.features.unsqueeze(2))
+
+    def gates(self, number: int, *, acts: bool) -> dict[str, Operand]:
+        """Returns all that a layer's cell depends on in a window."""
+        layer, network = self.layers[number], self.scan.network
+        bias = layer.b_input.detach()
+        if number == 0 and acts and network.b_acting is not None:
+            bias = bias + network.b_acting.detach()[:, 0]
         units = (*self.shape, network.hidden, 1)
-        self.present = known.observed.present[..., None, None].expand(-1, *units)
-        self.always = one.expand(units)
-        self.cells = []
-        for number, layer in enumerate(self.layers):
-            observing = acting = layer.b_input.detach()
-            if number == 0 and network.b_acting is not None:
-                acting = observing + network.b_acting.detach()[:, 0]
-            self.cells.append(
-                _Cell(
-                    projected=self.units(self.projected[number]),
-                    recurrent=self.units(self.recurrent[number]),
-                    carried=self.units(self.carried[number]),
-                    observing=self.units(observing.expand(*self.shape, -1)),
-                    acting=self.units(acting.expand(*self.shape, -1)),
-                    hidden_bias=self.units(layer.b_hidden.detach().expand(*self.shape, -1)),
-                )
-            )
+        present = Operand(self.motion.new_ones(()).expand(units))
+        if not acts:
+            observed = self.known.observed.present[..., None, None]
+            present = Operand.over(observed.expand(-1, *units))
+        return {
+            "projected": self.units(self.projected[number]),
+            "recurrent": self.units(self.recurrent[number]),
+            "carried": self.units(self.carried[number]),
+            "input_bias": Operand(self._by_unit(bias.expand(*self.shape, -1))),
+            "hidden_bias": Operand(self._by_unit(layer.b_hidden.detach().expand(*self.shape, -1))),
+            "present": present,
+        }
+
+    def units(self, values: Tensor, offset: int = 0) -> Operand:
+        """Returns values `(N, slots, D, k h)` of a window unit by unit."""
+        return Operand.over(self._by_unit(values.transpose(0, 1)), offset)
+
+    def _by_unit(self, values: Tensor) -> Tensor:
+        """Returns `(*batch, k h)` as `(*batch, h, k)`."""
+        return torch.unflatten(values, -1, (-1, self.scan.network.hidden)).transpose(-1, -2)
 
     @property
     def after(self) -> Stand:
         """Where trajectories stand behind the last window."""
-        slot = self.windows % self.slots
-        carried = tuple(kept[:, slot] for kept in self.carried)
+        carried = tuple(kept[:, self.windows % kept.shape[1]] for kept in self.carried)
         return Stand(self.motion[self.driven % len(self.motion)], carried)
 
-    @property
-    def layers(self) -> list[RecurrentLayer]:
-        """The recurrent layers."""
-        found = []
-        for layer in self.scan.network.layers:
-            assert isinstance(layer, RecurrentLayer)
-            found.append(layer)
-        return found
-
     def forward(self) -> None:
-        """Simulates the windows."""
-        scan, network = self.scan, self.scan.network
-        mean, scale = scan.step.core.scaler.mean, scan.step.core.scaler.scale
-        for window in range(self.windows):
-            slot, driven = window % self.slots, window - self.observed
-            if driven < 0:
-                features = self.known.observed.features[window]
-                torch.sub(features, mean[:, None], out=self.read[:, slot])
-                self.read[:, slot].div_(scale[:, None])
-            else:
-                scan.features.forward(self.around(driven), self.read[:, slot, None])
-            for number, layer in enumerate(self.layers):
-                torch.bmm(
-                    self.seen(number, window), layer.w_input, out=self.projected[number][slot]
-                )
-                before = self.carried[number][:, slot, :, : network.hidden]
-                torch.bmm(before, layer.w_hidden, out=self.recurrent[number][slot])
-                to = self.cells[number].carried[:, (window + 1) % self.slots]
-                scan.cell.forward(self.gates(number, window), to)
-            if driven >= 0:
-                torch.bmm(self.output(window), network.w_out, out=self.logits[slot])
-                moved = self.columns(self.motion[(driven + 1) % len(self.motion)])
-                scan.drive.forward(self.around(driven), *moved.values(), *self.frames(driven))
+        """Simulates all windows."""
+        observing = self._calls(acts=False) if self.observed > 0 else Calls()
+        acting = self._calls(acts=True) if self.driven > 0 else Calls()
 
-    def seen(self, number: int, window: int) -> Tensor:
-        """Returns what a layer reads in a window."""
-        if number == 0:
-            return self.read[:, window % self.slots]
-        below = self.carried[number - 1][:, (window + 1) % self.slots]
-        return below[..., : self.scan.network.hidden]
+        def simulate(networks: slice) -> None:
+            observing.run(range(self.observed), networks)
+            acting.run(range(self.observed, self.windows), networks)
 
-    def output(self, window: int) -> Tensor:
-        """Returns the outputs of the last layer, `(N, D, h)`."""
-        return self.carried[-1][:, (window + 1) % self.slots, :, : self.scan.network.hidden]
+        share(simulate, _parts(self.shape[0]), level="scan")
 
-    def frames(self, driven: int) -> tuple[Tensor, Tensor]:
-        """Returns where speeds and gaps of a window stand, `(N, 1, D, S)` each."""
-        stride = self.scan.step.stride
-        own = slice(driven * stride, (driven + 1) * stride)
-        return self.speed[:, None, :, own], self.gap[:, None, :, own]
+    def _calls(self, *, acts: bool) -> Calls:
+        """Returns what is computed in a window."""
+        calls, scan, network = Calls(), self.scan, self.scan.network
+        if acts:
+            scan.features.forward(calls, self.around, [self.in_driven(self.read)])
+        for number, layer in enumerate(self.layers):
+            seen, before = self.seen(number, acts=acts), _rows(self.carried[number])
+            calls.product(seen, layer.w_input, _rows(self.projected[number]))
+            calls.product(before.only(self.outputs), layer.w_hidden, _rows(self.recurrent[number]))
+            after = self.units(self.carried[number], 1)
+            scan.cell.forward(calls, self.gates(number, acts=acts), [after])
+        if acts:
+            calls.product(self.output(-1), network.w_out, self.in_driven(self.logits))
+            moved = self.columns(self.motion, 1 - self.observed)
+            results = [*moved.values(), self.frames(self.speed), self.frames(self.gap)]
+            scan.drive.forward(calls, self.around, results)
+        return calls
 
-    def columns(self, motion: Tensor) -> dict[str, Tensor]:
-        """Returns motion `(M, N, D)` by name, `(N, 1, D, width)` each."""
-        length = self.scan.step.length
-        last = motion.permute(1, 2, 0)[:, None]
-        names = ("position", "speed", "acceleration")
-        found = {name: last[..., k * length : (k + 1) * length] for k, name in enumerate(names)}
-        if last.shape[-1] > 3 * length:
-            found["memory"] = last[..., 3 * length :]
-        return found
 
-    def around(self, driven: int) -> dict[str, Tensor]:
-        """Returns all that the features and the steps of a window depend on."""
-        given = self.shared | self.columns(self.motion[driven % len(self.motion)])
-        position, speed, acceleration = self.leader
-        given["leader_position"] = position[driven]
-        given["leader_speed"] = speed[driven]
-        given["leader_acceleration"] = acceleration[driven]
-        given["logits"] = self.logits[(driven + self.observed) % self.slots][:, None]
-        return given
+def _rows(values: Tensor, offset: int = 0) -> Operand:
+    """Returns values `(N, slots, D, width)` of a window."""
+    return Operand.over(values.transpose(0, 1).unsqueeze(2), offset)
 
-    def units(self, values: Tensor) -> Tensor:
-        """Returns `(*batch, k h)` as `(*batch, h, k)`."""
-        hidden = self.scan.network.hidden
-        shape = (*values.shape[:-1], values.shape[-1] // hidden, hidden)
-        return values.view(shape).transpose(-1, -2)
 
-    def gates(self, number: int, window: int) -> dict[str, Tensor]:
-        """Returns all that a layer's cell depends on in a window."""
-        cell, slot = self.cells[number], window % self.slots
-        observes = window < self.observed
-        return {
-            "projected": cell.projected[slot],
-            "recurrent": cell.recurrent[slot],
-            "carried": cell.carried[:, slot],
-            "input_bias": cell.observing if observes else cell.acting,
-            "hidden_bias": cell.hidden_bias,
-            "present": self.present[window] if observes else self.always,
-        }
+def _parts(networks: int) -> list[slice]:
+    """Returns which networks each core takes."""
+    size = -(-networks // cores())
+    return [slice(first, min(first + size, networks)) for first in range(0, networks, size)]
 
 
 class _Gradients:
     """Back-propagation through a loop.
+
+    Gradients by gates and answers take the places of these.
 
     Args:
         loop: what was simulated.
@@ -457,101 +449,111 @@ class _Gradients:
     def __init__(self, loop: _Loop, speed: Tensor, gap: Tensor) -> None:
         self.loop = loop
         self.speed, self.gap = speed, gap
-        network = loop.scan.network
         self.of: dict[Tensor, Tensor] = {}
-        for weight in network.parameters():
+        for weight in loop.scan.network.parameters():
             self.of[weight] = torch.zeros_like(weight)
-        self.motion = torch.zeros_like(loop.motion[0])
-        self.carried = [torch.zeros_like(kept[:, 0]) for kept in loop.carried]
-        networks, trajectories = loop.shape
-        gates = network.gates * network.hidden
-        new = speed.new_empty
-        shape = (networks, _TOGETHER, trajectories)
-        self.projected = [new((*shape, gates)) for _ in loop.carried]
-        self.recurrent = [new((*shape, gates)) for _ in loop.carried]
-        self.logits = new((*shape, network.w_out.shape[-1]))
+        # Of a window and of the one behind it.
+        self.motion = speed.new_zeros((2, *loop.motion.shape[1:]))
+        self.carried = []
+        for kept in loop.carried:
+            networks, _, trajectories, width = kept.shape
+            self.carried.append(speed.new_zeros((networks, 2, trajectories, width)))
 
     def backward(self) -> None:
         """Goes back through all windows."""
         loop = self.loop
-        cuts = [*range(loop.windows, loop.observed, -_TOGETHER), loop.observed]
-        cuts += [*range(loop.observed - _TOGETHER, 0, -_TOGETHER), 0]
-        for last, first in itertools.pairwise(cuts):
-            for window in range(last - 1, first - 1, -1):
-                self._through(window, window - first)
-            self._add(first, last)
+        acting = self._calls(acts=True) if loop.driven > 0 else Calls()
+        observing = self._calls(acts=False) if loop.observed > 0 else Calls()
 
-    def _through(self, window: int, place: int) -> None:
-        """Goes back through a window, whose gradients by gates stand at a place."""
-        loop, scan = self.loop, self.loop.scan
-        network, hidden = scan.network, scan.network.hidden
-        driven = window - loop.observed
-        motion = torch.empty_like(self.motion)
-        if driven >= 0:
-            assert isinstance(loop.path, ThroughTime)
-            if window < loop.windows - 1:
-                self._bound(loop.path)
-            given = loop.around(driven)
-            stride = scan.step.stride
-            own = slice(driven * stride, (driven + 1) * stride)
-            gradients = [*loop.columns(self.motion).values()]
-            gradients += [self.speed[:, None, :, own], self.gap[:, None, :, own]]
-            logits = self.logits[:, place]
-            to = [*loop.columns(motion).values(), logits[:, None]]
-            scan.drive.backward(given, gradients, *to)
-            self.carried[-1][..., :hidden].baddbmm_(logits, network.w_out.mT)
-        for number in reversed(range(len(self.carried))):
-            layer = loop.layers[number]
-            projected = self.projected[number][:, place]
-            recurrent = self.recurrent[number][:, place]
-            before = torch.empty_like(self.carried[number])
-            to = [loop.units(projected), loop.units(recurrent), loop.units(before)]
-            scan.cell.backward(loop.gates(number, window), [loop.units(self.carried[number])], *to)
-            before[..., :hidden].baddbmm_(recurrent, layer.w_hidden.mT)
-            self.carried[number] = before
+        def go_back(networks: slice) -> None:
+            acting.run(range(loop.windows - 1, loop.observed - 1, -1), networks)
+            observing.run(range(loop.observed - 1, -1, -1), networks)
+            for first, last in ((loop.observed, loop.windows), (0, loop.observed)):
+                if first < last:
+                    self._add(first, last, networks)
+
+        share(go_back, _parts(loop.shape[0]), level="scan")
+
+    def _calls(self, *, acts: bool) -> Calls:
+        """Returns what is computed in a window."""
+        calls, loop, scan = Calls(), self.loop, self.loop.scan
+        network, last = scan.network, len(self.carried) - 1
+        if acts:
+            self._bound(calls)
+            gradients = [*loop.columns(self.motion, 1).values()]
+            gradients += [loop.frames(self.speed), loop.frames(self.gap)]
+            logits, to = loop.in_driven(loop.logits), loop.columns(self.motion, 0)
+            scan.drive.backward(calls, loop.around, gradients, [*to.values(), logits])
+            behind = _rows(self.carried[last], 1).only(loop.outputs)
+            calls.product(logits, network.w_out.mT, behind, adds=True)
+        for number in range(last, -1, -1):
+            layer, carried = loop.layers[number], self.carried[number]
+            projected, recurrent = loop.projected[number], loop.recurrent[number]
+            to_cell = [loop.units(projected), loop.units(recurrent), loop.units(carried)]
+            behind = loop.units(carried, 1)
+            scan.cell.backward(calls, loop.gates(number, acts=acts), [behind], to_cell)
+            before = _rows(carried).only(loop.outputs)
+            calls.product(_rows(recurrent), layer.w_hidden.mT, before, adds=True)
             if number > 0:
-                self.carried[number - 1][..., :hidden].baddbmm_(projected, layer.w_input.mT)
-            elif driven >= 0:
-                read = torch.bmm(projected, layer.w_input.mT)
-                seen = torch.empty_like(motion)
-                names = ("position", "speed", "acceleration")
-                to = [loop.columns(seen)[name] for name in names]
-                scan.features.backward(given, [read[:, None]], *to)
-                frames = 3 * scan.step.length
-                motion[:frames] += seen[:frames]
-        self.motion = motion
+                below = _rows(self.carried[number - 1], 1).only(loop.outputs)
+                calls.product(_rows(projected), layer.w_input.mT, below, adds=True)
+            elif acts:
+                self._through_features(calls, layer)
+        return calls
 
-    def _bound(self, path: ThroughTime) -> None:
-        """Bounds the gradients that come back through a window."""
-        if isinstance(path, ThroughMemory):
-            self.motion.zero_()
-        for gradient in (self.motion, *self.carried):
-            gradient.nan_to_num_(0.0, 0.0, 0.0).mul_(path.decay).clamp_(-path.clip, path.clip)
+    def _through_features(self, calls: Calls, layer: RecurrentLayer) -> None:
+        """Adds what goes back from the first layer to the motion before a window."""
+        loop = self.loop
+        read = Operand(loop.read.new_empty(loop.read[:, :1].shape))
+        calls.product(_rows(loop.projected[0]), layer.w_input.mT, read)
+        seen = loop.columns(torch.empty_like(self.motion[:1]), 0)
+        seen.pop("memory", None)
+        loop.scan.features.backward(calls, loop.around, [read], [*seen.values()])
+        before = loop.columns(self.motion, 0)
+        for name, gradient in seen.items():
+            calls.add(before[name], gradient)
 
-    def _add(self, first: int, last: int) -> None:
-        """Adds what some windows give to the gradients of weights."""
+    def _bound(self, calls: Calls) -> None:
+        """Adds what bounds the gradients that come back through a window."""
+        path, last = self.loop.path, self.loop.windows - 1
+        assert isinstance(path, ThroughTime)
+        decay = 0.0 if isinstance(path, ThroughMemory) else path.decay
+        for gradient in self.loop.columns(self.motion, 1).values():
+            calls.bound(gradient, decay, path.clip, but=last)
+        for carried in self.carried:
+            calls.bound(_rows(carried, 1), path.decay, path.clip, but=last)
+
+    def _add(self, first: int, last: int, networks: slice) -> None:
+        """Adds what some windows give to the gradients of some networks' weights."""
         loop, network = self.loop, self.loop.scan.network
-        count = last - first
+        drives = first >= loop.observed
         for number, layer in enumerate(loop.layers):
-            projected = self.projected[number][:, :count].flatten(1, 2)
-            recurrent = self.recurrent[number][:, :count].flatten(1, 2)
-            if number == 0:
-                read = loop.read[:, first:last]
+            projected = loop.projected[number][networks, first:last].flatten(1, 2)
+            recurrent = loop.recurrent[number][networks, first:last].flatten(1, 2)
+            if number > 0:
+                below = loop.carried[number - 1][networks, first + 1 : last + 1]
+                read = below[..., : network.hidden]
+            elif drives:
+                read = loop.read[networks]
             else:
-                read = loop.carried[number - 1][:, first + 1 : last + 1, :, : network.hidden]
-            before = loop.carried[number][:, first:last, :, : network.hidden]
-            self.of[layer.w_input].baddbmm_(read.flatten(1, 2).mT, projected)
-            self.of[layer.w_hidden].baddbmm_(before.flatten(1, 2).mT, recurrent)
+                read = loop.known.observed.features[:, networks].transpose(0, 1)
+            before = loop.carried[number][networks, first:last, :, : network.hidden]
+            self._of(layer.w_input, networks).baddbmm_(read.flatten(1, 2).mT, projected)
+            self._of(layer.w_hidden, networks).baddbmm_(before.flatten(1, 2).mT, recurrent)
             bias = projected.sum(1, keepdim=True)
-            self.of[layer.b_input] += bias
-            self.of[layer.b_hidden] += recurrent.sum(1, keepdim=True)
-            if number == 0 and first >= loop.observed and network.b_acting is not None:
-                self.of[network.b_acting] += bias[:, None]
-        if first >= loop.observed:
-            outputs = loop.carried[-1][:, first + 1 : last + 1, :, : network.hidden].flatten(1, 2)
-            logits = self.logits[:, :count].flatten(1, 2)
-            self.of[network.w_out].baddbmm_(outputs.mT, logits)
-            self.of[network.b_out] += logits.sum(1, keepdim=True)
+            self._of(layer.b_input, networks).add_(bias)
+            self._of(layer.b_hidden, networks).add_(recurrent.sum(1, keepdim=True))
+            if number == 0 and drives and network.b_acting is not None:
+                self._of(network.b_acting, networks).add_(bias[:, None])
+        if drives:
+            outputs = loop.carried[-1][networks, first + 1 : last + 1, :, : network.hidden]
+            logits = loop.logits[networks].flatten(1, 2)
+            self._of(network.w_out, networks).baddbmm_(outputs.flatten(1, 2).mT, logits)
+            self._of(network.b_out, networks).add_(logits.sum(1, keepdim=True))
+
+    def _of(self, weight: Tensor, networks: slice) -> Tensor:
+        """Returns the gradient by some networks' weights."""
+        return self.of[weight][networks]
 
 
 class _Trajectory(torch.autograd.Function):

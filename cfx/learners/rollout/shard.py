@@ -86,9 +86,9 @@ _TRAJECTORIES = 3_000
 """Of a shard's gradient step at most. A window costs as much per trajectory with 1,500 of them as
 with 6,000, and a tenth more with 700."""
 
-_WORTH_A_PROCESS = 3_000_000
-"""Simulated windows of all trajectories and gradient steps from which a training is cut: some
-twenty seconds on one core. A process needs five of them to begin."""
+_WORTH_A_PROCESS = 16_000_000
+"""Simulated windows of all trajectories and gradient steps from which a training is cut: some fifty
+seconds on one core. A process needs five of them to begin, and threads share most of a step."""
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,10 @@ from cfx.simulation.kernel.graph import Program, record_function
 from cfx.simulation.kernel.source import head
 
 _BLOCK = 64
-"""Elements that are loaded, computed and stored together."""
+"""Elements that are loaded, computed and stored together, at most."""
+
+_VECTOR = 16
+"""Elements of the longest vector registers."""
 
 _OPTIONS = ("-O1", "-ftree-vectorize")
 """Half the time to compile; and what -O3 does with conditions keeps long functions from vector
@@ -60,6 +63,11 @@ class Elementwise:
         wanted: numbers of the arguments by which it is differentiated; empty: none.
         key: what the function depends on besides how it is compiled; None: it is recorded anew in
             each process.
+        together: elements that are neighbours along C, if there are never more.
+
+    Attributes:
+        call_forward, call_backward: the compiled functions, as `cfx.simulation.kernel.sequence`
+            calls them: of arrays, the first of A and the last, B and C.
 
     Raises:
         Unsupported: it is not elementwise, or no compiler is found.
@@ -71,19 +79,21 @@ class Elementwise:
         inputs: Sequence[int],
         wanted: Collection[int] = (),
         key: object = None,
+        together: int = _BLOCK,
     ) -> None:
+        block = min(_BLOCK, -(-together // _VECTOR) * _VECTOR)
         lasting = None
         if key is not None:
-            described = [key, list(inputs), sorted(wanted), folder_hash(__file__)]
+            described = [key, list(inputs), sorted(wanted), block, folder_hash(__file__)]
             lasting = content_key([*described, torch.__version__])
 
         def source() -> str:
-            return _written(record_function(function, inputs, torch.float32), wanted)
+            return _written(record_function(function, inputs, torch.float32), wanted, block)
 
         library = compiler.build(compiler.remembered(lasting, source), *_OPTIONS)
         if library is None:
             raise Unsupported("there is no C++ compiler")
-        self._forward, self._backward = library.forward, library.backward
+        self.call_forward, self.call_backward = library.forward, library.backward
 
     def forward(self, inputs: Sequence[Tensor], *to: Tensor) -> None:
         """Computes the function.
@@ -92,7 +102,7 @@ class Elementwise:
             inputs: its arguments, `(A, B, C, width)` each; A, B and C are those of the first.
             to: where its results are written, of the same form.
         """
-        self._forward(_arrays((*inputs, *to)), *_sizes(inputs[0]))
+        self.call_forward(_arrays((*inputs, *to)), *_sizes(inputs[0]))
 
     def backward(
         self, inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], *to: Tensor
@@ -104,11 +114,11 @@ class Elementwise:
             gradients: by each result; None: 0.
             to: where the gradients by the wanted arguments are written.
         """
-        self._backward(_arrays((*inputs, *gradients, *to)), *_sizes(inputs[0]))
+        self.call_backward(_arrays((*inputs, *gradients, *to)), *_sizes(inputs[0]))
 
 
 def _sizes(like: Tensor) -> list[ctypes.c_long]:
-    return [ctypes.c_long(size) for size in like.shape[:3]]
+    return [ctypes.c_long(size) for size in (0, *like.shape[:3])]
 
 
 def _arrays(tensors: Sequence[Tensor | None]) -> Any:
@@ -122,9 +132,9 @@ def _arrays(tensors: Sequence[Tensor | None]) -> Any:
     return (ctypes.c_long * len(numbers))(*numbers)
 
 
-def _written(program: Program, wanted: Collection[int]) -> str:
+def _written(program: Program, wanted: Collection[int], block: int) -> str:
     """Returns the C++ source of `forward` and `backward`."""
-    lines = [head(torch.float32, _BLOCK), _LOOPS]
+    lines = [head(torch.float32, block), _LOOPS]
     inputs = _columns(program.inputs)
     outputs = _columns(program.outputs)
     body = []
@@ -167,9 +177,11 @@ def _function(
     name: str, loaded: _Places, body: Sequence[str], stored: _Places, first: int
 ) -> list[str]:
     """Returns a function that loads, computes and stores; stored arrays begin at `first`."""
-    lines = [f'extern "C" void {name}(const Array* arrays, long A, long B, long C) {{']
+    lines = [
+        f'extern "C" void {name}(const Array* arrays, long first, long last, long B, long C) {{'
+    ]
     lines += [f"  real {one}_[BLOCK];" for one, _ in itertools.chain(loaded, stored)]
-    lines.append("  for (long a = 0; a < A; ++a) for (long b = 0; b < B; ++b)")
+    lines.append("  for (long a = first; a < last; ++a) for (long b = 0; b < B; ++b)")
     lines.append("  for (long c = 0; c < C; c += BLOCK) {")
     lines.append("    const long count = std::min(BLOCK, C - c);")
     lines.append(

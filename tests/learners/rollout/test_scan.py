@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.core.threads import cores_limit, limit_cores
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout import RolloutSettings, scan, shard
 from cfx.learners.rollout.dataset import RolloutDataset
@@ -101,6 +102,19 @@ def test_other_ways_back(path: Any) -> None:
     assert len(eager) == len(compiled)
     for one, two in zip(eager, compiled, strict=True):
         torch.testing.assert_close(two, one, rtol=2e-3, atol=2e-3 * float(one.abs().max()))
+
+
+def test_threads_change_no_bit() -> None:
+    policy = GruPolicy(inputs=INPUTS, hidden_size=8, start="middle")
+    built = module(training_data(networks=3), policy, **SETTINGS)
+    found = []
+    before = cores_limit()
+    for cores in (1, 2):
+        limit_cores(cores)
+        found.append(both(built, ThroughTime(0.8, 0.5))[1])
+    limit_cores(before)
+    for one, two in zip(*found, strict=True):
+        assert torch.equal(one, two)
 
 
 def test_validation_is_that_of_pytorch() -> None:
