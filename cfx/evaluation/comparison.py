@@ -6,8 +6,10 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
+import numpy as np
 import pandas as pd
 
+from cfx.evaluation.headline import opposite
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 
 _SIGNIFICANT = 0.05
@@ -20,6 +22,7 @@ class Against(NamedTuple):
     Attributes:
         best, other: what they are called.
         found: by which share the best one's errors are smaller.
+        of_means: by which share its mean error over these pairs is smaller.
         p_value: of the Wilcoxon test, corrected for all comparisons (Holm 1979).
         left_out: pairs that only one of both has.
     """
@@ -27,6 +30,7 @@ class Against(NamedTuple):
     best: str
     other: str
     found: Improvement
+    of_means: float
     p_value: float
     left_out: int
 
@@ -51,14 +55,12 @@ def against_the_best(errors: Mapping[str, pd.DataFrame]) -> list[Against]:
         both = errors[best].merge(errors[other], on=["pair_id", "frames"], suffixes=("", "_other"))
         if both.empty:
             continue
-        found = improvement_statistics(
-            both["error_other"].to_numpy(float),
-            both["error"].to_numpy(float),
-            both["driver"].astype(str).tolist(),
-            seed=0,
-        )
+        before, after = both["error_other"].to_numpy(float), both["error"].to_numpy(float)
+        drivers = both["driver"].astype(str).tolist()
+        found = improvement_statistics(before, after, drivers, seed=0)
+        of_means = 1 - float(np.nanmean(after)) / float(np.nanmean(before))
         left_out = len(errors[best]) + len(errors[other]) - 2 * len(both)
-        compared.append(Against(best, other, found, found.p_value, left_out))
+        compared.append(Against(best, other, found, of_means, found.p_value, left_out))
     corrected = _holm([one.p_value for one in compared])
     return [one._replace(p_value=p) for one, p in zip(compared, corrected, strict=True)]
 
@@ -90,6 +92,9 @@ def verdict(compared: Sequence[Against]) -> str:
     interval = "one driver"
     if math.isfinite(found.ci95_low):
         interval = f"{100 * found.ci95_low:+.1f} to {100 * found.ci95_high:+.1f}"
+    otherwise = opposite(found.mean, least.of_means)
+    if otherwise:
+        interval += f"; {otherwise}"
     text += (
         f"; over the next best, {least.other}, {100 * found.mean:+.1f} % ({interval}), better for"
         f" {found.win_rate * found.pairs:.0f} of {found.pairs} pairs, p = {least.p_value:.2g}"

@@ -69,16 +69,20 @@ def ratio_of_means(metrics: Mapping[str, float], compared: Comparison) -> float:
     return (before - after) / before if before > 0 else math.nan
 
 
-def contradiction(metrics: Mapping[str, float], compared: Comparison) -> str:
-    """Returns what the means say where it is the opposite of the mean improvement of pairs; or "".
+def opposite(mean: float, of_means: float) -> str:
+    """Returns what a ratio of means says where a mean of ratios has the other sign; or "".
 
     A few drivers with small errors may outweigh all others in a mean of ratios.
     """
-    mean = metrics.get(f"{compared.key}/mean", math.nan)
-    ratio = ratio_of_means(metrics, compared)
-    if not mean * ratio < 0:
+    if not mean * of_means < 0:
         return ""
-    return f"mean of the pairs' improvements; of the mean RMSE {100 * ratio:+.1f} %"
+    return f"mean of the pairs' improvements; of the mean RMSE {100 * of_means:+.1f} %"
+
+
+def contradiction(metrics: Mapping[str, float], compared: Comparison) -> str:
+    """Returns what the means say where the mean improvement has the other sign; or ""."""
+    mean = metrics.get(f"{compared.key}/mean", math.nan)
+    return opposite(mean, ratio_of_means(metrics, compared))
 
 
 def main_error(metrics: Mapping[str, float]) -> float:

@@ -53,3 +53,14 @@ def test_only_pairs_with_the_same_frames_count() -> None:
     assert (one.found.pairs, one.left_out) == (30, 10)
     assert "10 pairs that only one of both has do not count" in verdict([one])
     assert verdict([]) == ""
+
+
+def test_means_that_say_the_opposite_are_told() -> None:
+    a = errors(1.0, 0.0, 0)
+    b = a.assign(error=0.7 * a["error"])
+    b.loc[0, "error"], a.loc[0, "error"] = 1.0, 0.03
+    (one,) = against_the_best({"a": a, "b": b})
+    assert one.best == "b"
+    assert one.found.mean < 0 < one.of_means
+    said = f"mean of the pairs' improvements; of the mean RMSE {100 * one.of_means:+.1f} %"
+    assert said in verdict([one])

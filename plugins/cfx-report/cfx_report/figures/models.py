@@ -9,6 +9,7 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.evaluation.comparison import Against
+from cfx.evaluation.headline import opposite
 from cfx.figures.canvas import canvas, draw_points, most_across, points, styled, wrapped
 from cfx.figures.text import EDGE, JOB_COLOURS, percent
 
@@ -42,7 +43,10 @@ def draw_models(errors: Mapping[str, pd.DataFrame], compared: Sequence[Against])
         axes.set_xlim(0, end)
         axes.set_ylim(0, end)
         axes.set_aspect("equal")
-        axes.set_title(f"{percent(one.found.mean, 1)} (p = {one.p_value:.2g})")
+        lead = f"{percent(one.found.mean, 1)} (p = {one.p_value:.2g})"
+        if opposite(one.found.mean, one.of_means):
+            lead += f"; of the means {percent(one.of_means, 1)}"
+        axes.set_title(f"{one.best} over {one.other}\n{lead}")
         axes.set_xlabel(wrapped(f"RMSE of speed of {one.best} (m/s)"))
         axes.set_ylabel(wrapped(f"RMSE of speed of {one.other} (m/s)"))
     for unused in grid.flat[len(shown) :]:
