@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -109,7 +110,9 @@ def command_of(name: str) -> str:
     recipe = RECIPES[name]
     files = ",".join(recipe.recordings)
     path = f"data.path={files}" if len(recipe.recordings) == 1 else f"'data.path=[{files}]'"
-    return f"python -m cfx {' '.join(recipe.overrides)} {path}"
+    # A shell takes lists of histories as they are, and the published commands have them so.
+    words = [shlex.quote(word) if set(word) & set("~ {*") else word for word in recipe.overrides]
+    return f"python -m cfx {' '.join(words)} {path}"
 
 
 def _train(name: str, data: Path, job: Path) -> None:
