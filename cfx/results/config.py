@@ -34,6 +34,8 @@ class CacheSettings(Settings):
     @field_validator("folder", mode="before")
     @classmethod
     def _path_or_url(cls, folder: Any) -> Any:
+        if not isinstance(folder, str | Path) or not str(folder).strip():
+            raise ValueError("write a folder or a URL; cache.enabled=false keeps nothing")
         if isinstance(folder, str) and not is_url(folder):
             return Path(folder)
         return folder

@@ -34,6 +34,8 @@ EXCEPTIONS = {
     "engine.*": "results do not depend on where the work runs, on purpose",
     "*.memory_mb": "how much is worked on at once",
     "*.workers": "how many share the work",
+    "simulator.followers": "results do not depend on how many share a network of SUMO, on purpose",
+    "krauss_sumo:simulator.seed": "the model draws no random numbers (sigma is 0)",
     "simulator.compile": "results do not depend on how steps are compiled, on purpose",
     "model.limits.comfortable_deceleration": "live drivers alone brake by it, in SUMO",
     "demo": "shows the results, on a page beside them; tests of demonstrations write it",

@@ -113,14 +113,15 @@ def _too_few(
     if together == "site" and found == 1:
         what += " (name those of its recordings with data.site)"
     more = f"{together}s" if together in {"recording", "site", "vehicle"} else "pairs"
+    lower = f"lower protocol.min_test_frames={min_frames} or " if min_frames else ""
     if folds is None:
         return (
             f"protocol.together={together}: {pairs.source} has only {found} {what} here, and one is"
-            f" left out at a time; use more {more}"
+            f" left out at a time; {lower}use more {more}"
         )
     return (
-        f"protocol.folds={folds}: {pairs.source} has only {found} {what} here; lower protocol.folds"
-        f" (2 at least) or use more {more}"
+        f"protocol.folds={folds}: {pairs.source} has only {found} {what} here; {lower}lower"
+        f" protocol.folds (2 at least) or use more {more}"
     )
 
 

@@ -166,7 +166,9 @@ def test_folds_follow_the_seed() -> None:
 
 
 def test_too_few_drivers_are_refused() -> None:
-    with pytest.raises(DataError, match=r"protocol\.folds=5: test has only 3 drivers here; lower"):
+    with pytest.raises(
+        DataError, match=r"protocol\.folds=5: test has only 3 drivers here; lower protocol\.folds"
+    ):
         AcrossDrivers().folds(chained(("1", "2"), ("2", "3"), ("3", "4"), ("9", "4")), seed=0)
     with pytest.raises(DataError, match="only 1 platoon here"):
         AcrossDrivers(folds=2, together="platoon").folds(chained(("1", "2"), ("2", "3")), seed=0)
@@ -342,7 +344,9 @@ def test_short_pairs_are_learned_from_but_not_tested() -> None:
 
 
 def test_too_few_long_pairs_are_refused() -> None:
-    with pytest.raises(DataError, match=r"has only 0 drivers with 5000 frames or more here"):
+    with pytest.raises(
+        DataError, match=r"has only 0 drivers.*lower protocol\.min_test_frames=5000 or"
+    ):
         AcrossDrivers(min_test_frames=5000).folds(chained(("1", "2"), ("2", "3")), seed=0)
 
 
