@@ -74,11 +74,22 @@ def test_a_job_config_cannot_be_changed() -> None:
         ("device=gpu", r"^device='gpu': choose auto, cpu, cuda or cuda:N"),
         ("dtype=float16", r"^dtype='float16': should be 'float32' or 'float64'"),
         ("threads=0", r"^threads=0: "),
+        (
+            "cache.folder=null",
+            r"^cache\.folder=None: write a folder or a URL; cache\.enabled=false",
+        ),
         ("windows.length=0", r"^windows\.length=0: "),
         (
             "style.cluster=agressive",
             r"^style\.cluster='agressive': should be 'all', 'conservative'",
         ),
+        ("metrics=[]", r"^metrics=\[\]: write all, or a list of names"),
+        ("metrics=3", r"^metrics=3: write all, or a list of names"),
+        (
+            "metrics=[rmse_gap,rmse_gap]",
+            r"^metrics=.*: 'rmse_gap' stands there twice; write each once",
+        ),
+        ("figures.formats=[png,png]", r"^figures\.formats=.*: 'png' stands there twice"),
         ("style.percentiles=[75,25]", r"^style.*percentiles"),
         ("+style.clster=all", r"^style\.clster: unknown key\. Did you mean 'cluster'\?"),
         ("+sede=1", r"^sede: unknown key\. Did you mean 'seed'\?"),

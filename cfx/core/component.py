@@ -7,21 +7,44 @@ import hashlib
 import inspect
 import json
 from abc import ABC
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, TypeVar, get_args
+from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError, ValidationInfo, field_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+)
 
 from cfx.core.errors import ConfigError, nearest
 
 Schema = TypeVar("Schema", bound=BaseModel)
+
+Values = TypeVar("Values", bound=Sequence[Any] | None)
 
 API_VERSION = 1
 """Version of what plugins may use.
 
 It rises only when a plugin that keeps to the public API would have to change.
 """
+
+
+def each_once(values: Values) -> Values:
+    """Returns the values; raises ValueError if one stands there twice."""
+    seen: list[Any] = []
+    for value in () if values is None else values:
+        if value in seen:
+            raise ValueError(f"{value!r} stands there twice; write each once")
+        seen.append(value)
+    return values
+
+
+Distinct = Annotated[Values, AfterValidator(each_once)]
+"""A setting that lists values, each of which stands there once: `Distinct[tuple[float, ...]]`."""
 
 
 class Settings(BaseModel):
@@ -149,13 +172,31 @@ def validate(schema: type[Schema], values: Any, *, where: str) -> Schema:
     try:
         return schema.model_validate(values)
     except ValidationError as error:
-        sentences = [_sentence(schema, problem, where) for problem in error.errors()]
+        at: dict[tuple[str, ...], list[Any]] = {}
+        for problem in error.errors():
+            at.setdefault(_location(values, problem), []).append(problem)
+        sentences = [_sentence(schema, key, found, where) for key, found in at.items()]
         raise ConfigError("\n".join(sentences)) from None
 
 
-def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
-    """Returns what one of pydantic's errors says, with the full path of the key."""
-    location = [str(part) for part in problem["loc"]]
+def _location(values: Any, problem: Any) -> tuple[str, ...]:
+    """Returns the keys that lead to a problem, without the names of a type's alternatives."""
+    keys, inside = [], values
+    for place, part in enumerate(problem["loc"]):
+        is_item = isinstance(inside, list | tuple) and isinstance(part, int) and part < len(inside)
+        if is_item or (isinstance(inside, Mapping) and part in inside):
+            inside = inside[part]
+        elif place > 0 and problem["type"] != "missing":
+            continue
+        keys.append(str(part))
+    return tuple(keys)
+
+
+def _sentence(
+    schema: type[BaseModel], location: Sequence[str], problems: Sequence[Any], where: str
+) -> str:
+    """Returns what pydantic's errors at a key say: one, or one for each alternative of its type."""
+    problem = problems[0]
     path = ".".join(part for part in [where, *location] if part)
     if problem["type"] == "extra_forbidden":
         known = sorted(_fields_at(schema, location[:-1]))
@@ -165,7 +206,8 @@ def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
         return text
     if problem["type"] == "missing":
         return f"{path}: a value is required; give one as {path}=..."
-    message = str(problem["msg"]).removeprefix("Value error, ").removeprefix("Input ")
+    said = [str(one["msg"]).removeprefix("Value error, ") for one in problems]
+    message = ", or ".join(dict.fromkeys(one.removeprefix("Input ") for one in said))
     if isinstance(problem["input"], Mapping):
         # Several settings contradict each other; the message names them.
         if message.startswith(path):
@@ -174,7 +216,7 @@ def _sentence(schema: type[BaseModel], problem: Any, where: str) -> str:
     return f"{path}={problem['input']!r}: {message}."
 
 
-def _fields_at(schema: type[BaseModel], location: list[str]) -> list[str]:
+def _fields_at(schema: type[BaseModel], location: Sequence[str]) -> list[str]:
     """Returns the names of the settings at a path; nothing where no settings are."""
     current: Any = schema
     for part in location:

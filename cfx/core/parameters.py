@@ -83,6 +83,34 @@ class Parameter:
         return bool(getattr(settings, name) == value)
 
 
+_WIDEST = 100.0
+"""How many times as large as a model's own bounds a config's may be; a unit is wrong beyond."""
+
+
+def _require_possible(declared: Parameter, key: str, low: float | None, high: float | None) -> None:
+    """Raises ParameterError for bounds of another sign than a model's, or far beyond them.
+
+    Args:
+        key: the setting that gives them.
+    """
+    most = _WIDEST * max(abs(declared.low), abs(declared.high))
+    wrong = ""
+    for value in (low, high):
+        if value is None:
+            continue
+        if declared.low >= 0 > value:
+            wrong = f"{value:g} is negative"
+        elif declared.high <= 0 < value:
+            wrong = f"{value:g} is positive"
+        elif abs(value) > most:
+            wrong = f"{value:g} is more than {_WIDEST:g} times as far"
+    if wrong:
+        raise ParameterError(
+            f"{key}: {wrong}, and the model's own bounds of {declared.name} are"
+            f" [{declared.low:g}, {declared.high:g}] {declared.unit}; give bounds that it can have"
+        )
+
+
 class ParameterOverride(Settings):
     """Changes of one parameter by a config; the rest stays as the model declares it."""
 
@@ -168,6 +196,9 @@ class ParameterSpace:
             if change is None:
                 merged.append(parameter)
             else:
+                key = f"model.parameters.{parameter.name}"
+                _require_possible(parameter, f"{key}.low", change.low, None)
+                _require_possible(parameter, f"{key}.high", None, change.high)
                 merged.append(replace(parameter, **change.model_dump(exclude_none=True)))
         for name, given in changes.items():
             if name in self._by_name:
@@ -294,7 +325,7 @@ def _check_adaptation(
     space: ParameterSpace, bounds: Mapping[str, tuple[float, float] | None]
 ) -> None:
     for name, ends in bounds.items():
-        space[name]  # raises where there is no such parameter
+        parameter = space[name]
         if ends is None:
             continue
         low, high = ends
@@ -303,6 +334,7 @@ def _check_adaptation(
                 f"model.adaptation_bounds.{name}=[{low}, {high}]: the first must be below the"
                 " second, and both finite"
             )
+        _require_possible(parameter, f"model.adaptation_bounds.{name}", low, high)
 
 
 def _for_adaptation(parameter: Parameter, bounds: tuple[float, float] | None) -> Parameter:

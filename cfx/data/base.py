@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
 from cfx.core import registry, scratch
-from cfx.core.component import Component, Settings
+from cfx.core.component import Component, Distinct, Settings
 from cfx.core.errors import DataError, PluginError, listed, nearest
 from cfx.core.files import absolute
 from cfx.core.memory import give_back
@@ -85,8 +85,10 @@ class DatasetSettings(Settings):
         description="a regular expression whose group finds, in a follower's id, the name that its"
         " vehicle keeps over recordings, such as '^[0-9]+-(.+)$'; null: what the source says",
     )
-    lanes: list[int] | None = Field(None, description="keep pairs in these lanes alone; null: all")
-    pair_ids: list[str] | None = Field(
+    lanes: Distinct[list[int] | None] = Field(
+        None, description="keep pairs in these lanes alone; null: all"
+    )
+    pair_ids: Distinct[list[str] | None] = Field(
         None, description="keep these pairs alone, by their ids; null: all"
     )
     driver_type: str | None = Field(

@@ -40,8 +40,8 @@ class ImitationSettings(Settings):
         description="consecutive windows per gradient step, the recurrent state carried on; null:"
         " the whole trajectory; 1 in the paper",
     )
-    learning_rate: float = Field(3e-3, gt=0, description="of Adam")
-    weight_decay: float = Field(0.0, ge=0, description="of AdamW, decoupled")
+    learning_rate: float = Field(3e-3, gt=0, le=1, description="of Adam")
+    weight_decay: float = Field(0.0, ge=0, le=10, description="of AdamW, decoupled")
     validation: float = Field(
         0.1,
         ge=0,

@@ -36,6 +36,7 @@ class KraussSettings(ModelSettings):
     leader_deceleration: float | None = Field(
         None,
         gt=0,
+        le=50,
         description="b_l, m/s2: deceleration expected of the leader; null: the same as b",
     )
 

@@ -20,14 +20,20 @@ _AT = 1e-6
 class LimitSettings(Settings):
     """Limits of a vehicle's acceleration; the defaults are those of SUMO's passenger car."""
 
-    acceleration: float = Field(2.6, gt=0, description="m/s2: largest acceleration")
+    acceleration: float = Field(2.6, gt=0, le=50, description="m/s2: largest acceleration")
     comfortable_deceleration: float = Field(
-        4.5, gt=0, description="m/s2: hardest braking of a live vehicle that nothing endangers"
+        4.5,
+        gt=0,
+        le=50,
+        description="m/s2: hardest braking of a live vehicle that nothing endangers",
     )
-    emergency_deceleration: float = Field(9.0, gt=0, description="m/s2: hardest braking at all")
+    emergency_deceleration: float = Field(
+        9.0, gt=0, le=50, description="m/s2: hardest braking at all"
+    )
     response_time: float | None = Field(
         None,
         gt=0,
+        le=10,
         description="s: time constant with which the acceleration follows the model's; null: at"
         " once",
     )

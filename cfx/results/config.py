@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import Field, field_validator
 
 from cfx.calibration.settings import CalibrationSettings, WindowSettings
-from cfx.core.component import Settings, validate
+from cfx.core.component import Distinct, Settings, each_once, validate
 from cfx.core.errors import ConfigError, without_passwords
 from cfx.core.storage import is_url
 from cfx.data.style import StyleSettings
@@ -96,7 +96,7 @@ class FigureSettings(Settings):
     """What is drawn."""
 
     enabled: bool = Field(True, description="write figures")
-    formats: tuple[Literal["png", "pdf", "svg"], ...] = Field(
+    formats: Distinct[tuple[Literal["png", "pdf", "svg"], ...]] = Field(
         ("png",), min_length=1, description="files of each figure; pdf and svg for a paper"
     )
 
@@ -169,8 +169,10 @@ class JobConfig(Settings):
     @classmethod
     def _several(cls, metrics: Any) -> Any:
         if isinstance(metrics, str) and metrics != "all":
-            return (metrics,)
-        return metrics
+            metrics = (metrics,)
+        if not metrics or not isinstance(metrics, str | list | tuple):
+            raise ValueError("write all, or a list of names such as [rmse_speed, rmse_gap]")
+        return metrics if isinstance(metrics, str) else each_once(metrics)
 
     @property
     def is_calibration(self) -> bool:

@@ -57,7 +57,7 @@ class SyntheticSettings(DatasetSettings):
     seed: int = Field(0, ge=0, description="same seed, same data")
     pairs: int = Field(8, ge=1, description="number of leader-follower pairs")
     frames: int = Field(600, ge=2, description="frames of each pair")
-    dt: float = Field(0.1, gt=0, le=1, description="time step, s")
+    dt: float = Field(0.1, ge=0.001, le=1, description="time step, s")
     platoon_size: int = Field(
         4, ge=1, description="followers in a platoon; each is the leader of the next"
     )
@@ -75,10 +75,10 @@ class SyntheticSettings(DatasetSettings):
         0.6, ge=0, le=1, description="how much drivers differ; 0: all at the model's defaults"
     )
     noise_position_m: float = Field(
-        0.0, ge=0, description="standard deviation of measured positions, m"
+        0.0, ge=0, le=10, description="standard deviation of measured positions, m"
     )
     noise_speed_mps: float = Field(
-        0.0, ge=0, description="standard deviation of measured speeds, m/s"
+        0.0, ge=0, le=10, description="standard deviation of measured speeds, m/s"
     )
 
     @field_validator("cruise_mps")

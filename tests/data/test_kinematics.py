@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from cfx.core.errors import DataError
 from cfx.data.base import Dataset
 from cfx.data.describe import describe
-from cfx.data.kinematics import check_kinematics, contradiction, contradictions, in_words
+from cfx.data.kinematics import (
+    check_kinematics,
+    contradiction,
+    contradictions,
+    in_words,
+    typical_contradiction,
+)
 from cfx.data.pairs import Pair, PairSet
 from cfx.data.tidy import TidyDataset, frame_of
 from cfx.data.tracks import driven
@@ -159,3 +165,13 @@ def test_real_recordings_are_let_through(path: Path) -> None:
     kind = TidyDataset if path.suffix == ".parquet" else NgsimDataset
     dataset = kind(path=path, min_frames=20, check="off", accelerations="recorded")
     assert not list(contradictions(dataset.load()))
+
+
+@pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
+@pytest.mark.parametrize("count", [4, 6, 8, 12])
+def test_a_few_pairs_of_a_real_recording_are_let_through(count: int) -> None:
+    path = SHARED / "openacc_zalazone_pairs.parquet"
+    pairs = TidyDataset(path=path, min_frames=900, check="off", accelerations="recorded").load()
+    for first in range(0, len(pairs) - count, count):
+        some = PairSet(pairs.pairs[first : first + count], "some")
+        assert typical_contradiction(some) is None

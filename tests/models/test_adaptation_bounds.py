@@ -35,6 +35,7 @@ def test_adaptation_bounds_never_move_bounds_inwards() -> None:
             r"model\.adaptation_bounds\.t_r=\[2\.0, 1\.0\]: the first must be below",
         ),
         ({"t_r": None, "t_i": None}, "could move none"),
+        ({"t_r": (-1.0, 2.0)}, r"adaptation_bounds\.t_r: -1 is negative"),
     ],
 )
 def test_wrong_adaptation_bounds_are_named(
@@ -42,6 +43,24 @@ def test_wrong_adaptation_bounds_are_named(
 ) -> None:
     with pytest.raises(ParameterError, match=message):
         Krauss(adaptation_bounds=adaptation_bounds)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (
+            {"t_r": {"low": -1.0}},
+            r"model\.parameters\.t_r\.low: -1 is negative, .*own bounds of t_r",
+        ),
+        ({"t_r": {"high": 1500.0}}, r"t_r\.high: 1500 is more than 100 times as far"),
+        ({"t_r": {"low": 5.0, "high": 1.0}}, r"parameter t_r: low \(5\.0\) must be below high"),
+    ],
+)
+def test_bounds_that_no_driver_can_have_are_refused(
+    change: dict[str, dict[str, float]], message: str
+) -> None:
+    with pytest.raises(ParameterError, match=message):
+        Krauss(parameters=change)
 
 
 def test_adaptation_bounds_need_both_ends() -> None:

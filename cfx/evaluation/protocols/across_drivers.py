@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 import pandas as pd
 from pydantic import Field, model_validator
@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.windows import Split
-from cfx.core.component import Settings
+from cfx.core.component import Distinct, Settings
 from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.folds import Together, assign_folds, describe_folds, learned_from
@@ -77,7 +77,7 @@ class AcrossDriversSettings(Settings):
         description="the driver's own parameters drive beside the policy in the test part, each"
         " with the share that their errors in the driver's past give it; needs history: null",
     )
-    histories: tuple[float, ...] = Field(
+    histories: Distinct[tuple[Annotated[float, Field(ge=0)], ...]] = Field(
         (0.0, 10.0, 30.0),
         description="s: other amounts of history to compare, for policies of offsets; empty: none",
     )

@@ -60,9 +60,9 @@ class OptimisationSettings(Settings):
     )
     steps: int = Field(25, ge=1, description="gradient steps of an epoch")
     learning_rate: float = Field(
-        3e-3, gt=0, description="of Adam, at its highest; it falls to 0 along a cosine"
+        3e-3, gt=0, le=1, description="of Adam, at its highest; it falls to 0 along a cosine"
     )
-    weight_decay: float = Field(1e-4, ge=0, description="of AdamW, decoupled")
+    weight_decay: float = Field(1e-4, ge=0, le=10, description="of AdamW, decoupled")
     gradient_clip: float | None = Field(
         1.0, gt=0, description="largest gradient norm of a network; null: none"
     )
@@ -124,6 +124,7 @@ class ColdStartSettings(Settings):
     scaling: float = Field(
         0.15,
         ge=0,
+        le=1,
         description="augmentation: standard deviation of the logarithm of a factor on distances,"
         " speeds and accelerations of a cold start",
     )

@@ -35,16 +35,21 @@ class FilterSettings(ResidualSettings):
     """Settings of filters of parameters; parameters are in the squashed space (logits)."""
 
     spread: float = Field(
-        0.5, gt=0, description="standard deviation of a driver's parameters around the pooled ones"
+        0.5,
+        gt=0,
+        le=10,
+        description="standard deviation of a driver's parameters around the pooled ones",
     )
     drift: float = Field(
         0.02,
         ge=0,
+        le=10,
         description="standard deviation by which parameters change within a second (process noise)",
     )
     noise: float = Field(
         2.0,
         gt=0,
+        le=100,
         description="m/s2: standard deviation of a window's mean acceleration around the model's"
         " (measurement noise); what drivers do beyond the model lasts for several windows, so more"
         " than the error in a single one",

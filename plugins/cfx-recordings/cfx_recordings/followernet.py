@@ -40,7 +40,7 @@ class FollowernetSettings(FileDatasetSettings):
     )
     recorded_step: float = Field(
         0.1,
-        gt=0,
+        ge=0.001,
         le=2.0,
         description="s between two samples: 0.04 for HighD, 0.1 for the others; the file does not"
         " say it, but speeds and spacings show where it is wrong",
@@ -48,6 +48,7 @@ class FollowernetSettings(FileDatasetSettings):
     vehicle_length: float = Field(
         0.0,
         ge=0,
+        le=100,
         description="m: taken off every spacing; 0 where it is bumper to bumper. In NGSIM's and"
         " Waymo's events it holds a vehicle's length (some 4.5 and 4.9 m)",
     )

@@ -6,7 +6,7 @@ https://sumo.dlr.de/docs/Simulation/Output/FCDOutput.html
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -30,14 +30,15 @@ class SumoFcdSettings(FileDatasetSettings):
         120.0, gt=0, description="m: farther vehicles are no leaders; null: all are"
     )
     length: float = Field(
-        5.0, gt=0, description="m: of vehicles whose length nothing in the file gives"
+        5.0, gt=0, le=100, description="m: of vehicles whose length nothing in the file gives"
     )
-    lengths: dict[str, float] | None = Field(
+    lengths: dict[str, Annotated[float, Field(gt=0, le=100)]] | None = Field(
         None, description="m: of vehicles by their vType, for instance {truck: 12.0}"
     )
     width: float = Field(
         1.8,
         gt=0,
+        le=10,
         description="m: vehicles in one lane that are farther apart sideways drive side by side"
         " (SUMO's sublane model)",
     )

@@ -82,9 +82,11 @@ class TrafficSettings(FoldsOrFinishedSettings):
         (900.0, 1300.0, 1700.0, 2100.0),
         description="vehicles/h that enter the open roads; empty: there are none",
     )
-    entry_speed: float = Field(15.0, gt=0, description="m/s: with which vehicles enter open roads")
+    entry_speed: float = Field(
+        15.0, gt=0, le=100, description="m/s: with which vehicles enter open roads"
+    )
     bottleneck_speed: float = Field(
-        6.0, gt=0, description="m/s: speed limit in the bottleneck of open roads"
+        6.0, gt=0, le=100, description="m/s: speed limit in the bottleneck of open roads"
     )
     bottleneck: tuple[float, float] = Field(
         (1000.0, 1500.0),
