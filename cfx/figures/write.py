@@ -16,7 +16,6 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.backends.backend_pdf import FigureCanvasPdf
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
@@ -119,6 +118,9 @@ def _print(figure: Figure, path: Path, form: str) -> None:
         paper = FigureCanvasAgg(figure)
         paper.print_png(path, metadata=metadata)
     elif form == "pdf":
+        # Imported where it is used: it takes as long as a few figures.
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf
+
         paper = FigureCanvasPdf(figure)
         paper.print_pdf(path, metadata=metadata)
     else:

@@ -432,11 +432,13 @@ class RolloutModule(BatchedModule):
         if self.dataset.base.device.type == "cpu":
             key = window.key()
             try:
-                self.scans[window] = Scan(window, temperature, key, trains=True)
-                self.scans[exact] = Scan(exact, None, key, trains=False)
+                scans = {window: Scan(window, temperature, key, trains=True)}
+                scans[exact] = Scan(exact, None, key, trains=False)
+                Scan.compile(list(scans.values()))
             except Unsupported as reason:
                 log.info("Training has no compiled loop (%s); PyTorch compiles a window", reason)
             else:
+                self.scans = scans
                 if not self.is_stochastic and not self.settings.distillation_epochs:
                     return
         window.compile()

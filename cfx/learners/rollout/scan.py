@@ -89,11 +89,11 @@ class _Part:
             return function(known)
 
         used = [widths[name] for name in self.names]
-        self.compiled = Elementwise(of_values, used, numbers, key, **options)
+        self.code = Elementwise(of_values, used, numbers, key, **options)
 
     def forward(self, calls: Calls, given: Mapping[str, Operand], to: Sequence[Operand]) -> None:
         """Adds the call that computes the part and writes its results."""
-        calls.elementwise(self.compiled.call_forward, [*self._of(given), *to])
+        calls.elementwise(self.code.compiled.forward, [*self._of(given), *to])
 
     def backward(
         self,
@@ -103,7 +103,7 @@ class _Part:
         to: Sequence[Operand],
     ) -> None:
         """Adds the call that writes the gradients by the wanted arguments."""
-        calls.elementwise(self.compiled.call_backward, [*self._of(given), *gradients, *to])
+        calls.elementwise(self.code.compiled.backward, [*self._of(given), *gradients, *to])
 
     def _of(self, given: Mapping[str, Operand]) -> list[Operand]:
         return [given[name] for name in self.names]
@@ -148,6 +148,19 @@ class Scan:
         self.cell = _Part(
             self._cell, gates | more, list(gates), [key, "cell"], together=network.hidden
         )
+
+    @staticmethod
+    def compile(scans: Sequence[Scan]) -> None:
+        """Compiles several windows, on all cores.
+
+        Raises:
+            Unsupported: the compiler fails.
+        """
+        codes = {}
+        for scan in scans:
+            for part in (scan.features, scan.drive, scan.cell):
+                codes[part.code.source] = part.code
+        share(lambda code: code.compiled, list(codes.values()), level="compiler")
 
     def simulate(
         self,

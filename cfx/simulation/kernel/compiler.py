@@ -30,7 +30,8 @@ log = logging.getLogger(__name__)
 
 FLAGS = (
     "-std=c++17",
-    "-O3",
+    "-O1",
+    "-ftree-vectorize",
     "-march=native",
     "-fno-math-errno",
     "-fno-trapping-math",
@@ -38,7 +39,8 @@ FLAGS = (
     "-shared",
     "-fPIC",
 )
-"""None of them changes a result: operations are rounded as PyTorch rounds them, one by one."""
+"""None of them changes a result: operations are rounded as PyTorch rounds them, one by one. What
+-O3 does with conditions takes longer, and keeps long functions from vector registers."""
 
 _VECTOR_MATH = ("-DVECTOR_MATH", "-lmvec", "-lm", "-Wl,-z,defs")
 """Exponentials, logarithms and powers of a whole vector register by glibc, to 4 units in the last
@@ -72,6 +74,7 @@ def build(source: str, *options: str) -> ctypes.CDLL | None:
     path = cache_folder() / f"{_key(source, compiler, flags)}.so"
     try:
         if not path.is_file():
+            _tell()
             _compile([compiler, *flags], source, path)
         return ctypes.CDLL(str(path))
     except (OSError, subprocess.SubprocessError) as error:
@@ -97,6 +100,12 @@ def remembered(key: str | None, make: Callable[[], str]) -> str:
         log.info("The cache of kernels cannot be used (%s)", error)
         return make()
     return text
+
+
+@functools.cache
+def _tell() -> None:
+    """Says once what takes a while the first time."""
+    log.info("Compiling for this processor; what is compiled is kept in %s", cache_folder())
 
 
 def _compile(compiler: list[str], source: str, path: Path) -> None:

@@ -10,6 +10,7 @@ of 0 broadcast. Vector registers hold neighbours along C.
 from __future__ import annotations
 
 import ctypes
+import functools
 import itertools
 from collections.abc import Callable, Collection, Sequence
 from typing import Any
@@ -30,11 +31,8 @@ _BLOCK = 64
 _VECTOR = 16
 """Elements of the longest vector registers."""
 
-_OPTIONS = ("-O1", "-ftree-vectorize")
-"""Half the time to compile; and what -O3 does with conditions keeps long functions from vector
-registers."""
-
 _LOOPS = """\
+// Of arrays, for networks from the first to the last: A, B and C as in Python.
 struct Array { real* data; long a, b, c, column; };
 #define CALLED static __attribute__((noinline)) void
 CALLED load(real* to, const Array& from, long at, long count) {
@@ -66,8 +64,7 @@ class Elementwise:
         together: elements that are neighbours along C, if there are never more.
 
     Attributes:
-        call_forward, call_backward: the compiled functions, as `cfx.simulation.kernel.sequence`
-            calls them: of arrays, the first of A and the last, B and C.
+        source: C++.
 
     Raises:
         Unsupported: it is not elementwise, or no compiler is found.
@@ -90,10 +87,23 @@ class Elementwise:
         def source() -> str:
             return _written(record_function(function, inputs, torch.float32), wanted, block)
 
-        library = compiler.build(compiler.remembered(lasting, source), *_OPTIONS)
-        if library is None:
+        if compiler.find_compiler() is None:
             raise Unsupported("there is no C++ compiler")
-        self.call_forward, self.call_backward = library.forward, library.backward
+        self.source = compiler.remembered(lasting, source)
+
+    @functools.cached_property
+    def compiled(self) -> ctypes.CDLL:
+        """Functions `forward` and `backward`, as `cfx.simulation.kernel.sequence` calls them.
+
+        Compiled at the first use; several can be at the same time.
+
+        Raises:
+            Unsupported: the compiler fails.
+        """
+        library = compiler.build(self.source)
+        if library is None:
+            raise Unsupported("the C++ compiler fails")
+        return library
 
     def forward(self, inputs: Sequence[Tensor], *to: Tensor) -> None:
         """Computes the function.
@@ -102,7 +112,7 @@ class Elementwise:
             inputs: its arguments, `(A, B, C, width)` each; A, B and C are those of the first.
             to: where its results are written, of the same form.
         """
-        self.call_forward(_arrays((*inputs, *to)), *_sizes(inputs[0]))
+        self.compiled.forward(_arrays((*inputs, *to)), *_sizes(inputs[0]))
 
     def backward(
         self, inputs: Sequence[Tensor], gradients: Sequence[Tensor | None], *to: Tensor
@@ -114,7 +124,7 @@ class Elementwise:
             gradients: by each result; None: 0.
             to: where the gradients by the wanted arguments are written.
         """
-        self.call_backward(_arrays((*inputs, *gradients, *to)), *_sizes(inputs[0]))
+        self.compiled.backward(_arrays((*inputs, *gradients, *to)), *_sizes(inputs[0]))
 
 
 def _sizes(like: Tensor) -> list[ctypes.c_long]:

@@ -23,8 +23,8 @@ from cfx.simulation.kernel.columns import Unsupported
 _COLUMNS = 16
 """Of a product, computed together for a few rows: two vector registers."""
 
-_MULTIPLY_AND_ADD = "-ffp-contract=fast"
-"""Products add what they multiply without rounding between, as libraries for matrices do."""
+_OPTIONS = ("-O3", "-ffp-contract=fast")
+"""Sums of a product stay in registers, and are rounded once for a product and a sum."""
 
 _SOURCE = """\
 #include <algorithm>
@@ -147,7 +147,7 @@ class Calls:
     """
 
     def __init__(self) -> None:
-        library = compiler.build(_SOURCE, _MULTIPLY_AND_ADD)
+        library = compiler.build(_SOURCE, *_OPTIONS)
         if library is None:
             raise Unsupported("there is no C++ compiler")
         self._run = library.run
