@@ -6,7 +6,7 @@ never looks ahead. Shapes: f features of a token, N networks, B drivers of each,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from typing import Literal, NamedTuple
 
 import torch
@@ -287,11 +287,27 @@ class Scaler(nn.Module):
             values: `(N, B, W, f)`.
             mask: which windows count, bool `(N, B, W)`.
         """
-        weight = mask[..., None].to(values.dtype)
-        total = weight.sum((1, 2)).clamp(min=1.0)
-        mean = (values * weight).sum((1, 2)) / total
-        variance = ((values - mean[:, None, None]).square() * weight).sum((1, 2)) / total
-        scale = variance.sqrt()
+        return cls.of_parts(lambda: [(values, mask)])
+
+    @classmethod
+    def of_parts(cls, parts: Callable[[], Iterable[tuple[Tensor, Tensor]]]) -> Scaler:
+        """As `of`, some drivers after the other.
+
+        Args:
+            parts: gives features `(N, b, W, f)` and masks `(N, b, W)` of the next drivers; called
+                twice.
+        """
+        total, added = torch.zeros(()), torch.zeros(())
+        for values, mask in parts():
+            weight = mask[..., None].to(values.dtype)
+            total = total.to(weight) + weight.sum((1, 2))
+            added = added.to(weight) + (values * weight).sum((1, 2))
+        total = total.clamp(min=1.0)
+        mean, squares = added / total, torch.zeros_like(added)
+        for values, mask in parts():
+            weight = mask[..., None].to(values.dtype)
+            squares += ((values - mean[:, None, None]).square() * weight).sum((1, 2))
+        scale = (squares / total).sqrt()
         return cls(mean, torch.where(scale > _LEAST_SCALE, scale, 1.0))
 
     def forward(self, values: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ import torch
 from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.policies.base import Policy
-from cfx.policies.features import INPUT_SETS, INPUTS, History, token_width, tokens
+from cfx.policies.features import INPUT_SETS, INPUTS, History, Scaler, token_width, tokens
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.policies.recurrent import RecurrentNetwork
@@ -109,3 +109,18 @@ def test_an_untrained_network_is_the_fixed_model(component: type[Policy]) -> Non
     out, _ = network(torch.randn((2, 3, 5, 4)), network.initial_state(2, 3))
     expected = fixed.clamp(0.02, 0.98)[:, None, None].expand_as(out)
     torch.testing.assert_close(out, expected)
+
+
+def test_a_scaler_measures_drivers_in_parts() -> None:
+    """The number of drivers that are read at once changes nothing but rounding."""
+    generator = torch.Generator().manual_seed(0)
+    values = 3.0 + torch.randn((2, 7, 5, 3), dtype=torch.float64, generator=generator)
+    mask = torch.rand((2, 7, 5), generator=generator) > 0.3
+    whole = Scaler.of(values, mask)
+    cuts = (slice(0, 4), slice(4, 7))
+    parts = Scaler.of_parts(lambda: [(values[:, cut], mask[:, cut]) for cut in cuts])
+    for network in range(2):
+        counted = values[network][mask[network]]
+        torch.testing.assert_close(parts.mean[network], counted.mean(0))
+        torch.testing.assert_close(parts.scale[network], counted.std(0, correction=0))
+    torch.testing.assert_close(parts.scale, whole.scale)

@@ -205,9 +205,12 @@ class RolloutDataset:
         What is sampled for a network does not depend on which others stand beside it.
         """
         rows, pair = torch.unique(self.pair[networks], return_inverse=True)
+        recordings = self.recordings
+        if len(rows) < len(recordings.pair):
+            recordings = recordings[rows]
         return replace(
             self,
-            recordings=self.recordings[rows],
+            recordings=recordings,
             pair=pair,
             trains=self.trains[networks],
             validates=self.validates[networks],
@@ -509,12 +512,17 @@ def _measured_tokens(
     device = batch.lengths.device
     end = int(last.max()) + 1
     windows = torch.arange(0, end, training_data.windows.stride, device=device)
-    found = []
+    found = torch.empty(0)
     for part in _parts(len(batch)):
         pairs = torch.arange(part.start, part.stop, device=device)[:, None]
         history = measured_history(batch, pairs, windows, training_data.windows.length)
-        found.append(tokens(history, policy.inputs, policy.summary))
-    return torch.cat(found)
+        own = tokens(history, policy.inputs, policy.summary)
+        if part.start == 0:
+            room = scratch.empty((len(batch), *own.shape[1:]), np.float32)
+            found = torch.as_tensor(room).to(device)
+        found[part] = own
+        scratch.release()
+    return found
 
 
 def _driver_features(
@@ -544,12 +552,24 @@ def _scaler(
     known = driver_features.isnan().logical_not().all(-1)
     means, scales = [], []
     for number, own in enumerate(pair):
-        center = squashed(base[number])[:, None].expand(-1, windows, -1)
-        windows_counted = counted[number]
-        of_base = Scaler.of(torch.cat([seen[own], center], -1)[None], windows_counted[None])
-        values = driver_features[own].nan_to_num()[:, None].expand(-1, windows, -1)
-        is_known = windows_counted & known[own][:, None]
-        of_driver = Scaler.of(values[None], is_known[None])
-        means.append(torch.cat([of_base.mean, of_driver.mean], -1))
-        scales.append(torch.cat([of_base.scale, of_driver.scale], -1))
+
+        def of_base(number: int = number, own: Tensor = own) -> _Values:
+            for part in _parts(len(own)):
+                center = squashed(base[number, part])[:, None].expand(-1, windows, -1)
+                values = torch.cat([seen[own[part]], center], -1)
+                yield values[None], counted[number, part][None]
+                scratch.release()
+
+        def of_driver(number: int = number, own: Tensor = own) -> _Values:
+            for part in _parts(len(own)):
+                values = driver_features[own[part]].nan_to_num()[:, None].expand(-1, windows, -1)
+                yield values[None], (counted[number, part] & known[own[part]][:, None])[None]
+
+        found = Scaler.of_parts(of_base), Scaler.of_parts(of_driver)
+        means.append(torch.cat([one.mean for one in found], -1))
+        scales.append(torch.cat([one.scale for one in found], -1))
     return Scaler(torch.cat(means), torch.cat(scales))
+
+
+_Values = Iterator[tuple[Tensor, Tensor]]
+"""Features of the next drivers, and which windows count."""
