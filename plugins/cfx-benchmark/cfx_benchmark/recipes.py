@@ -52,6 +52,18 @@ RECIPES = {
         " drives as they do, beside their own parameters.",
         EVERY_ROAD,
     ),
+    "idm-acc": Recipe(
+        (
+            "experiment=every_road",
+            "data.driver_type=acc",
+            "~data.site",
+            "+data.site={openacc?zalazone*: ZalaZone, openacc?vicolungo*: Vicolungo,"
+            " openacc*: Ispra}",
+            *_ONE_NETWORK,
+        ),
+        "Intelligent Driver Model for cars with adaptive cruise control, without history and with.",
+        EVERY_ROAD[1:],
+    ),
     "w99": Recipe(
         ("experiment=every_road", "model=w99_wide", "learner.jerk_weight=0.01", *_ONE_NETWORK),
         "Wiedemann 99 for drivers of any road, without history and with; Vissim's family.",
