@@ -49,6 +49,9 @@ _SHOWN = 3
 _SAME = 0.08
 """How far a measured factor may be from one that is known."""
 
+_SAME_GAP = 0.12
+"""The same of a gap's change on the relative speed, which is noisier."""
+
 _MOST = 0.75
 """Share of the windows that count as most of them."""
 
@@ -128,6 +131,9 @@ _LIKELY = {
     "acceleration": ("m/s2", "g_0", "ft/s2", "km/h/s"),
 }
 """Units in which recordings have a quantity; more would be taken for one another."""
+
+_LIKELY_BY_GAP = ("m/s", "km/h", "ft/s", "mph")
+"""Units of speeds beside gaps alone, where knots cannot be told from a time step twice as long."""
 
 _ACCELERATION_FACTORS = {
     10.0: "they are 0.1 times what the speeds say; write m/s2",
@@ -417,21 +423,31 @@ def _by_gap(found: Contradiction, pair: Pair, units: Units) -> Contradiction:
         leader + follower,
         follower,
     )
+    slope = _gap_relation(pair).measured(pair.dt).slope
+    of_all: dict[str, float] = {}
     for unit in _LIKELY["gap"]:
+        if unit == own["gap"]:
+            continue
         scale = factor(unit, "m") / factor(own["gap"], "m")
-        corrected[f"the gaps look like {unit}, not {own['gap']}"] = (gap * scale, leader, follower)
-    for unit in _LIKELY["speed"]:
+        of_all[f"the gaps look like {unit}, not {own['gap']}"] = 1 / scale
+    for unit in _LIKELY_BY_GAP:
+        if unit == own["speed"]:
+            continue
         scale = factor(unit, "m/s") / factor(own["speed"], "m/s")
         look = f"look like {unit}, not {own['speed']}"
-        corrected[f"the speeds {look}"] = (gap, leader * scale, follower * scale)
+        of_all[f"the speeds {look}"] = scale
         corrected[f"the leader's speeds {look}"] = (gap, leader * scale, follower)
         corrected[f"the follower's speeds {look}"] = (gap, leader, follower * scale)
+    known = {words: one for words, one in of_all.items() if abs(slope / one - 1) < _SAME_GAP}
+    if not known and slope > 0:
+        known[f"the time step looks like {slope * pair.dt:.3g} s, not {pair.dt:.3g} s"] = slope
+    for words, scale in known.items():
+        corrected[words] = (gap, leader * scale, follower * scale)
     best, least, rule = found.words, 0.5, _RULES["gap"]
     for words, (gaps, ahead, behind) in corrected.items():
         after = agreement(gaps, ahead - behind, pair.dt)
         if after.left < least and not rule.breaks_slope(after):
             best, least = words, after.left
-    slope = _gap_relation(pair).measured(pair.dt).slope
     return replace(found, signals="gap and speeds", quantity="gap", slope=slope, words=best)
 
 
@@ -446,7 +462,7 @@ def _why_gap(gap: float, units: Units) -> str:
     own = _units_of("follower", units)
     known = {-1.0: "the leader's and the follower's columns look swapped"}
     known |= _factors(own, slower=("gap",), faster=("speed",))
-    reason = _named(gap, known, 0.15)
+    reason = _named(gap, known, _SAME_GAP)
     return (
         f"the gap changes {gap:.3g} times as the relative speed says: {reason or _gap_units(own)}"
     )

@@ -93,7 +93,6 @@ class FollowernetDataset(Dataset):
                 series.append(self._series(path, number, event))
             if not series:
                 raise DataError(f"{path}: holds no events")
-            self._check_step(path, series)
             parts.append(pairs_of(series, str(path)))
         pairs = joined(parts)
         problem = "events carry no drivers' ids: one driver may be learned from and tested"
@@ -118,28 +117,6 @@ class FollowernetDataset(Dataset):
             signals={"leader_speed": event[_LEADER_SPEED], "follower_speed": event[_SPEED]},
             gap=event[_SPACING] - self.settings.vehicle_length,
         )
-
-    def _check_step(self, path: Path, series: list[Series]) -> None:
-        """Raises DataError if spacings change faster or slower than the relative speeds say."""
-        moved = expected = 0.0
-        for one in series:
-            relative = one.signals["leader_speed"] - one.signals["follower_speed"]
-            middle = (relative[1:] + relative[:-1]) / 2
-            assert one.gap is not None  # _series gives one
-            change = np.diff(one.gap)
-            both = np.isfinite(change) & np.isfinite(middle)
-            moved += float((change[both] * middle[both]).sum())
-            expected += float((middle[both] ** 2).sum())
-        if not expected:
-            return
-        step = moved / expected
-        given = self.settings.recorded_step
-        if not 0.75 < step / given < 1.33:
-            raise DataError(
-                f"{path}: spacings change as if samples were {step:.3g} s apart, not {given:g} s;"
-                f" set data.recorded_step={step:.2g}, if the speeds are in m/s and the spacings in"
-                " m"
-            )
 
 
 def _events(path: Path) -> Iterator[Floats]:

@@ -189,7 +189,7 @@ def _pairs(store: _Store) -> PairSet:
             leader_id=f"leader-{number}",
             follower_id=str(number),
             dt=DT,
-            frame=frames_at(store.time[run], DT),
+            frame=frames_at(store.time[run], DT, f"{store.path}, pair {number}"),
             signals=signals,
             leader_length=float(store.sizes["leader"][number]),
             driver_types=(types[0],),

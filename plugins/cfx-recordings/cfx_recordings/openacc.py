@@ -129,7 +129,7 @@ def _read(path: Path) -> _File:
     return _File(
         path,
         about,
-        frames_at(table.numbers["Time"], DT),
+        frames_at(table.numbers["Time"], DT, str(path)),
         _by_place(table.numbers, "Speed"),
         _by_place(table.numbers, "IVS"),
         _by_place(table.labels, "Driver"),

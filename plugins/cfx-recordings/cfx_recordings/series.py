@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from cfx.core.errors import DataError
 from cfx.data.files import Floats, Ints
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.tracks import (
@@ -21,6 +22,9 @@ from cfx.data.tracks import (
     summed,
     unique_name,
 )
+
+_STEP_ROOM = 0.05
+"""How far the typical step between times may be from the layout's, as a share of it."""
 
 
 @dataclass(frozen=True)
@@ -166,7 +170,23 @@ def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
     )
 
 
-def frames_at(time: Floats, dt: float) -> Ints:
-    """Returns the frame number of each time, 0 at the first, `(T,)`."""
+def frames_at(time: Floats, dt: float, source: str) -> Ints:
+    """Returns the frame number of each time, 0 at the first, `(T,)`.
+
+    Args:
+        time: s.
+        dt: step of the layout, s.
+        source: file, and what of it.
+
+    Raises:
+        DataError: the times are mostly in other steps.
+    """
+    steps = np.diff(np.unique(time))
+    step = float(np.median(steps)) if len(steps) else dt
+    if abs(step / dt - 1) > _STEP_ROOM:
+        raise DataError(
+            f"{source}: the time step is {step:.3g} s, not the {dt:g} s of this layout; correct the"
+            " times, or write the tidy layout"
+        )
     frames: Ints = np.rint((time - time[0]) / dt).astype(np.int64)
     return frames

@@ -116,7 +116,7 @@ def _series(file: Table, rows: Mapping[str, Floats]) -> Series | None:
     of_leader = np.flatnonzero(rows["local_veh_id"] == leader)
     if not len(of_follower) or not len(of_leader):
         return None
-    frame = frames_at(rows[_TIME], DT)
+    frame = frames_at(rows[_TIME], DT, f"{file.source}, segment {segment}")
     _require_once(file, segment, frame, of_follower)
     _require_once(file, segment, frame, of_leader)
     both, in_follower, in_leader = np.intersect1d(

@@ -320,8 +320,30 @@ def test_events_say_what_is_wrong(tmp_path: Path, events: np.ndarray, says: str)
 
 
 def test_a_wrong_step_is_seen_in_the_spacings(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"set data\.recorded_step=0\.1"):
-        FollowernetDataset(path=npy(tmp_path, made_pairs()), recorded_step=0.04).read()
+    path = npy(tmp_path, made_pairs(frames=300))
+    with pytest.raises(DataError, match=r"time step looks like 0\.\d+ s, not 0\.04 s"):
+        FollowernetDataset(path=path, recorded_step=0.04).load()
+
+
+@pytest.mark.parametrize("name", ["waymo_pairs", "lyft_pairs", "openacc"])
+def test_times_in_other_steps_are_named(name: str, tmp_path: Path) -> None:
+    cls, write = READERS[name]
+    slow = cfx.get("dataset", "synthetic")(pairs=3, frames=150, min_frames=2)
+    path = write(tmp_path, slow.load())  # type: ignore[attr-defined]  # a dataset
+    if path.is_dir():
+        import zarr
+
+        times = zarr.open_group(str(path))["timestamp"]
+        times[:] = 2.0 * times[:]
+    else:
+        lines = path.read_text().splitlines()
+        table = pd.read_csv(path, skiprows=5 if name == "openacc" else 0)
+        column = "Time" if name == "openacc" else "local_time"
+        above = lines[:5] if name == "openacc" else []
+        table[column] *= 2.0
+        path.write_text("\n".join([*above, table.to_csv(index=False)]))
+    with pytest.raises(DataError, match=r"the time step is 0\.2 s, not the 0\.1 s"):
+        cls(path=path, min_frames=2).load()
 
 
 def test_a_spacing_that_holds_a_vehicle_is_corrected(tmp_path: Path) -> None:
