@@ -96,6 +96,16 @@ def laplace(posterior: Posterior, starts: Tensor) -> Normal:
     )
 
 
+def curvature(posterior: Posterior, place: Tensor) -> Tensor:
+    """Returns the curvature of the log density (Gauss and Newton's), `(P, S, d, d)`.
+
+    Args:
+        posterior: of P drivers.
+        place: coordinates, `(P, S, d)`.
+    """
+    return _around(posterior, place).curvature
+
+
 def likely_starts(posterior: Posterior, seed: int) -> Tensor:
     """Returns the likeliest of some places all over the prior, logits `(P, S, n)`.
 
