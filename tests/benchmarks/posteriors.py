@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal
 
+import numpy as np
 import torch
 from scipy.stats import chisquare
 from scoringrules import crps_ensemble
@@ -199,7 +200,9 @@ def forecast_scores(
             if step not in AHEAD_S or origin - 1 + step >= len(errors):
                 continue
             off = errors[origin - 1 + step] - expected
-            score = crps_ensemble(0.0, off.numpy(), estimator="fair", backend="numpy")
+            score = crps_ensemble(
+                np.zeros(len(off)), off.numpy(), estimator="fair", backend="numpy"
+            )
             rank = (off < 0).double().mean(1)
             counts = (origin >= known) & (origin + step <= last)
             found = torch.stack([torch.as_tensor(score), (rank > 0.05) & (rank < 0.95)])
