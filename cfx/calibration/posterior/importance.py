@@ -39,7 +39,7 @@ SAMPLES = 100
 _PLACES = 3
 """Components of each round that lie at single samples. As many samples again are of the component
 that takes mean and covariance of all, since W99's density jumps and has no useful curvature.
-Without any, intervals of IDM drivers with errors of the gap hold the truth for 84 % instead of 87 %
+Without any, intervals of IDM drivers with errors of the gap hold the truth for 84 % instead of 86 %
 (300 drivers)."""
 
 DRAWS = 200
@@ -53,7 +53,7 @@ the truth for 86 to 87 %, of those below 0.5 for 89 %."""
 
 _TEMPERED = 40.0
 """Effective sample size of the weights that a component is made of. Of IDM's drivers with errors of
-the gap 93 % settle, of 80 % with weights cut off at the root of their number instead."""
+the gap 93 % of 60 settle, 80 % with weights cut off at the root of their number instead."""
 
 _HALVINGS = 20
 """Halvings by which the power of weights is found."""
