@@ -42,9 +42,8 @@ from cfx.simulation.rollout import can_compile
 log = logging.getLogger(__name__)
 
 _WORTH_COMPILING = 5_000
-"""Windows simulated in training, one after the other, from which compiling pays: some ten seconds
-of
-eager work."""
+"""Windows simulated in training, one after the other, from which compiling pays: some ten
+seconds of eager work."""
 
 _LEAST_TEMPERATURE = 0.02
 """Below this a smoothed switch has no gradient that single precision resolves."""
