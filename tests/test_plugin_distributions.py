@@ -24,6 +24,7 @@ READERS = {
     "cfx.data.files",
     "cfx.data.pairs",
     "cfx.data.resample",
+    "cfx.data.sites",
     "cfx.data.table",
     "cfx.data.tracks",
 }
@@ -80,6 +81,7 @@ POLICIES = {
     "cfx.calibration.losses",
     "cfx.calibration.prior",
     "cfx.policies.checkpoint",
+    "cfx.policies.context",
     "cfx.policies.ready",
     "cfx.policies.valid_range",
     "cfx.simulation.trajectory",

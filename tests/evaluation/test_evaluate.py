@@ -61,7 +61,7 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
     ) == (1, 0)
     assert "full_trajectory/collisions/fixed" not in metrics
     adaptation_space = model.space.for_adaptation(
-        {model.space.names[0]: (-5.0, 5.0)}
+        {model.space.names[0]: (0.01, 3.0)}
     )  # then the policy's value is none of its bounds
     within = evaluate(
         ComparedPairs(pairs, batch, first, style),
