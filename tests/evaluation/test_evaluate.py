@@ -30,7 +30,7 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
     braked[0, 5:] = 9.0  # one frame at -10 m/s2
     braked[0, 15:] = 1.0  # the first pair has ended by then
     hard = calm._replace(
-        speed=braked, parameters=torch.where(torch.arange(2) == 0, model.space.bounds()[0], middle)
+        speed=braked, parameters=torch.where(torch.arange(2) == 0, model.space.bounds()[1], middle)
     )
     style = StyleResult(
         pd.DataFrame({"driver": [p.driver for p in pairs], "score": [0.2, 0.8], "cluster": [0, 2]}),
@@ -61,7 +61,7 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
     ) == (1, 0)
     assert "full_trajectory/collisions/fixed" not in metrics
     adaptation_space = model.space.for_adaptation(
-        {model.space.names[0]: (0.01, 3.0)}
+        {model.space.names[0]: (0.1, 20.0)}
     )  # then the policy's value is none of its bounds
     within = evaluate(
         ComparedPairs(pairs, batch, first, style),
