@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from cfx.evaluation.headline import opposite
+from cfx.evaluation.headline import lower_by, opposite
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 
 _SIGNIFICANT = 0.05
@@ -58,9 +58,10 @@ def against_the_best(errors: Mapping[str, pd.DataFrame]) -> list[Against]:
         before, after = both["error_other"].to_numpy(float), both["error"].to_numpy(float)
         drivers = both["driver"].astype(str).tolist()
         found = improvement_statistics(before, after, drivers, seed=0)
-        of_means = 1 - float(np.nanmean(after)) / float(np.nanmean(before))
+        known = np.isfinite(before) & np.isfinite(after)
+        sums = float(before[known].sum()), float(after[known].sum())  # of as many pairs as means
         left_out = len(errors[best]) + len(errors[other]) - 2 * len(both)
-        compared.append(Against(best, other, found, of_means, found.p_value, left_out))
+        compared.append(Against(best, other, found, lower_by(*sums), found.p_value, left_out))
     corrected = _holm([one.p_value for one in compared])
     return [one._replace(p_value=p) for one, p in zip(compared, corrected, strict=True)]
 

@@ -66,6 +66,11 @@ def ratio_of_means(metrics: Mapping[str, float], compared: Comparison) -> float:
     """Returns by what share the policy's mean RMSE of speed is lower; NaN if that is not known."""
     before = metrics.get(key_of("rmse_speed", compared.baseline, compared.scope), math.nan)
     after = metrics.get(key_of("rmse_speed", "policy", compared.scope), math.nan)
+    return lower_by(before, after)
+
+
+def lower_by(before: float, after: float) -> float:
+    """Returns by what share an error is lower than one before; NaN where that is not known."""
     return (before - after) / before if before > 0 else math.nan
 
 

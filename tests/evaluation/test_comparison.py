@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -64,3 +66,10 @@ def test_means_that_say_the_opposite_are_told() -> None:
     assert one.found.mean < 0 < one.of_means
     said = f"mean of the pairs' improvements; of the mean RMSE {100 * one.of_means:+.1f} %"
     assert said in verdict([one])
+
+
+def test_jobs_without_any_error_are_not_said_to_disagree() -> None:
+    perfect = errors(1.0, 0.0, 0).assign(error=0.0)
+    (one,) = against_the_best({"a": perfect, "b": perfect})
+    assert math.isnan(one.of_means)
+    assert "of the mean RMSE" not in verdict([one])
