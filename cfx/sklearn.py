@@ -19,10 +19,10 @@ from cfx.api.fit import prepared
 from cfx.api.pairs import Pairs, read
 from cfx.api.simulation import simulate
 from cfx.calibration.identifiability import losses_of
-from cfx.calibration.windows import Split
 from cfx.core.errors import DataError
 from cfx.core.guest import visit
 from cfx.evaluation.protocols.base import ProtocolContext
+from cfx.simulation.windows import Split
 
 _SHORTEST = 2
 """Frames of the shortest pair that is read: every row of a table counts."""

@@ -7,7 +7,6 @@ from typing import Any
 
 import torch
 
-from cfx.calibration.windows import WindowSettings
 from cfx.core import registry
 from cfx.models.base import DrivingModel
 from cfx.policies.agent import Agent
@@ -19,6 +18,7 @@ from cfx.policies.heads.direct import DirectHead
 from cfx.policies.heads.offset import OffsetHead
 from cfx.policies.heads.residual import ResidualHead
 from cfx.policies.heads.stochastic import StochasticHead
+from cfx.simulation.windows import WindowSettings
 
 INPUTS = ("leader_speed", "follower_speed", "gap", "follower_acceleration", "leader_acceleration")
 

@@ -19,15 +19,13 @@ FLOORS = (
     ("core",),
     ("data", "models"),
     ("simulation",),
-    ("calibration",),
-    ("policies",),
+    ("calibration", "policies"),
     ("learners",),
     ("evaluation",),
     ("results",),
     ("figures",),
     ("app", "contracts"),
-    ("api",),
-    ("sklearn",),
+    ("api", "sklearn"),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 

@@ -238,7 +238,7 @@ def calibrate(
     assert recording is not None
     with visit():
         context, parts = prepared(experiment, recording)
-        from cfx.calibration.windows import Split
+        from cfx.simulation.windows import Split
 
         with closing(parts.engine):
             last = Split.of(context.pairs, context.windows, context.split).frame

@@ -29,7 +29,6 @@ from cfx.calibration.shards import (
     Solver,
     WindowShard,
 )
-from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import scratch
 from cfx.core.component import content_key
 from cfx.core.engine import Engine
@@ -37,6 +36,7 @@ from cfx.core.local_engine import LocalEngine
 from cfx.core.parameters import ParameterSpace
 from cfx.core.progress import Task
 from cfx.data.pairs import Pair, PairBatch, PairSet
+from cfx.simulation.windows import Windows, WindowSettings
 
 _GROUP = 1024
 """Problems solved together: enough to fill the batch, few enough that an interruption loses

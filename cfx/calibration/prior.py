@@ -15,13 +15,12 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from cfx.core.parameters import squashed
+
 _WEIGHTS = {"weak": 0.01, "none": 0.0}
 """Weights of the priors. With the weak one, a parameter that is one unit of the squashed space away
 from its default costs 1 % of the default's loss over n; 13 instead of 33 m/s, of 1 to 70, is 1.4
 units away."""
-
-_EDGE = 0.005
-"""Least distance to a bound, in unit space, that a logit is taken at, so that it is finite."""
 
 
 def prior_weight(name: str) -> float:
@@ -78,8 +77,3 @@ class Prior:
             candidates = candidates[:1]
         away = squashed(candidates) - self.center.to(candidates)
         return self.weight * self.scale * away.square().mean(-1)
-
-
-def squashed(unit: Tensor) -> Tensor:
-    """Returns logits of parameters in unit space, finite also at the bounds."""
-    return torch.logit(unit.clamp(_EDGE, 1.0 - _EDGE))

@@ -20,12 +20,12 @@ from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
 from cfx.calibration.objectives.base import Objective
 from cfx.calibration.objectives.rmse import SpeedRmse
 from cfx.calibration.optimizers.base import Optimizer, Solution
-from cfx.calibration.prior import Prior, squashed
+from cfx.calibration.prior import Prior
 from cfx.core import registry
 from cfx.core.component import content_key, folder_hash
 from cfx.core.engine import Report, Unfit
 from cfx.core.errors import EngineError, PluginError
-from cfx.core.parameters import ParameterSpace
+from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
 from cfx.simulation.base import Stepper
 

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
-from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.contracts.contract import contract_of
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
@@ -30,6 +29,7 @@ from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx.simulation.windows import Split, Windows, WindowSettings
 
 PAIRS, FRAMES = 3, 126
 WINDOWS = WindowSettings()

@@ -5,11 +5,11 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.calibration.settings import WindowSettings
 from cfx.contracts.contract import contract_of, expect_tensor
 from cfx.models.idm import IDM
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width
+from cfx.simulation.settings import WindowSettings
 
 NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 7, 5, 5
 """As many parameters as IDM has, for which a policy is built."""

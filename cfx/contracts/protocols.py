@@ -19,7 +19,6 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.calibration.windows import WindowSettings
 from cfx.contracts.contract import NotApplicable, contract_of
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.data.style import StyleSettings, measure_style
@@ -33,6 +32,7 @@ from cfx.policies.fixed import FixedPolicy
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx.simulation.windows import WindowSettings
 
 PAIRS, FRAMES = 6, 111
 

@@ -28,6 +28,10 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
+_EDGE = 0.005
+"""Least distance to a bound, in unit space, that a logit is taken at, so that it is finite."""
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One parameter of a driving model.
@@ -319,6 +323,11 @@ class ParameterSpace:
                     f"parameter {name}={value} lies outside its bounds"
                     f" [{parameter.low}, {parameter.high}] {parameter.unit}"
                 )
+
+
+def squashed(unit: Tensor) -> Tensor:
+    """Returns logits of parameters in unit space, finite also at the bounds."""
+    return unit.clamp(_EDGE, 1.0 - _EDGE).logit()
 
 
 def _check_adaptation(

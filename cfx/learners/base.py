@@ -19,7 +19,6 @@ from torch import Tensor
 from cfx.calibration.calibrator import Labels
 from cfx.calibration.objectives.base import Objective
 from cfx.calibration.objectives.rmse import SpeedRmse
-from cfx.calibration.windows import Split, WindowSettings
 from cfx.core.component import Component
 from cfx.core.engine import Engine
 from cfx.core.errors import ConfigError
@@ -30,6 +29,7 @@ from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import Scaler
 from cfx.policies.valid_range import ValidRange
 from cfx.simulation.base import Stepper
+from cfx.simulation.windows import Split, WindowSettings
 
 CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
 

@@ -21,7 +21,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.calibration.windows import WindowSettings
 from cfx.core import registry
 from cfx.core.errors import DataError, PluginError
 from cfx.core.parameters import ParameterSpace
@@ -36,6 +35,7 @@ from cfx.policies.heads.offset import blended, shrunk
 from cfx.policies.placement import ALL, driver_places
 from cfx.policies.valid_range import SIGNALS, ValidRange, situation_of, weight_of_answer
 from cfx.simulation.base import Stepper
+from cfx.simulation.windows import WindowSettings
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -19,8 +19,8 @@ from cfx.policies.driver_features import check_driver_features, named_driver_fea
 from cfx.policies.features import SITUATION, Summary, check_inputs, named_inputs
 
 if TYPE_CHECKING:
-    from cfx.calibration.settings import WindowSettings
     from cfx.models.base import DrivingModel
+    from cfx.simulation.settings import WindowSettings
 
 
 class PolicyNetwork(nn.Module, ABC):

@@ -17,7 +17,6 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from safetensors import SafetensorError
 from torch import Tensor
 
-from cfx.calibration.windows import WindowSettings
 from cfx.core import registry
 from cfx.core.errors import ConfigError, DataError, ParameterError
 from cfx.core.files import atomic_write
@@ -31,6 +30,7 @@ from cfx.policies.features import Scaler
 from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.valid_range import SIGNALS, ValidRange
+from cfx.simulation.windows import WindowSettings
 
 _FORMAT = 3
 

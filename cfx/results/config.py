@@ -12,11 +12,12 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator
 
-from cfx.calibration.settings import CalibrationSettings, WindowSettings
+from cfx.calibration.settings import CalibrationSettings
 from cfx.core.component import Distinct, Settings, each_once, validate
 from cfx.core.errors import ConfigError, without_passwords
 from cfx.core.storage import is_url
 from cfx.data.style import StyleSettings
+from cfx.simulation.settings import WindowSettings
 
 Node = dict[str, Any]
 """A component's node, `{name: ..., settings...}`: `cfx.core.registry.create` validates it against

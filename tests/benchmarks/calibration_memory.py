@@ -19,13 +19,13 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.core import registry
 from cfx.core.threads import limit_cores
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.tidy import TidyDataset
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Split, Windows, WindowSettings
 
 _FILE = Path(__file__).parents[3] / "shared" / "data" / "i80_reconstructed_pairs.parquet"
 _NETWORKS = 6

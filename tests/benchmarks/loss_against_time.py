@@ -21,13 +21,13 @@ from torch import Tensor
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives.rmse import SpeedRmse
 from cfx.calibration.optimizers.base import Optimizer
-from cfx.calibration.windows import Split, WindowSettings
 from cfx.core import registry
 from cfx.core.threads import limit_cores
 from cfx.data.pairs import PairBatch
 from cfx.data.tidy import TidyDataset
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Split, WindowSettings
 
 _FILE = Path(__file__).parents[3] / "shared" / "data" / "i80_reconstructed_pairs.parquet"
 _SPLIT = 0.8

@@ -15,13 +15,13 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import threads
 from cfx.core.engine import Engine
 from cfx.core.local_engine import LocalEngine
 from cfx.data.pairs import PairBatch
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Windows, WindowSettings
 from cfx_dask.engine.engine import DaskEngine
 from tests.core.engine.work import slowly
 from tests.drives import wavy_pairs

@@ -16,7 +16,6 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.calibration.windows import Split, WindowSettings
 from cfx.core.threads import one_thread
 from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData, TrainingPairs
@@ -29,6 +28,7 @@ from cfx.models.w99 import W99
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.offset import NONE
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Split, WindowSettings
 from tests.drives import wavy_pairs
 
 NETWORKS, DRIVERS, FRAMES = 6, 57, 700

@@ -10,7 +10,6 @@ import torch
 from torch import nn
 
 from cfx.calibration.calibrator import Labels
-from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.core.threads import one_thread
 from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData, TrainingPairs
@@ -18,6 +17,7 @@ from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Split, Windows, WindowSettings
 from tests.drives import straight_pairs
 
 PAIRS, FRAMES, EPOCHS, BATCH = 94, 700, 5, 16

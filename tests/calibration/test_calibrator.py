@@ -23,7 +23,6 @@ from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import CalibrationShard, Solver
-from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import threads
 from cfx.core.engine import Engine, Report
 from cfx.core.errors import OutputError
@@ -33,6 +32,7 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx.simulation.windows import Windows, WindowSettings
 from tests.drives import straight_pairs, wavy_pairs
 
 SETTINGS = WindowSettings()

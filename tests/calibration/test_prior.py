@@ -18,9 +18,9 @@ from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.calibration.prior import Prior, prior_weight, squashed
+from cfx.calibration.prior import Prior, prior_weight
 from cfx.calibration.shards import Solver
-from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.core.parameters import Parameter, ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Follower, Leader
 from cfx.models.idm import IDM

@@ -8,7 +8,6 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.calibration.windows import WindowSettings
 from cfx.data.pairs import PairBatch
 from cfx.data.style import StyleResult
 from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
@@ -25,6 +24,7 @@ from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.direct import DirectHead
 from cfx.simulation.rollout import MemoryStepper, simulate
 from cfx.simulation.trajectory import Start
+from cfx.simulation.windows import WindowSettings
 from tests.drives import wavy_pairs
 
 SPEEDS = ("leader_speed", "follower_speed")

@@ -10,7 +10,6 @@ from typing import Any
 
 import torch
 
-from cfx.calibration.windows import Split, WindowSettings
 from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
@@ -25,6 +24,7 @@ from cfx.policies.core import AgentCore
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class, head_name
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Split, WindowSettings
 from tests.drives import wavy_pairs
 
 WINDOWS = WindowSettings()

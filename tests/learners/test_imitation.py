@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from cfx.calibration.calibrator import Labels
-from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.contracts import check_contract
 from cfx.core.errors import DataError
 from cfx.data.pairs import PairBatch
@@ -23,6 +22,7 @@ from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
 from cfx.policies.placement import group_by
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Split, Windows, WindowSettings
 from tests.drives import wavy_pairs
 from tests.learners.made import ready
 

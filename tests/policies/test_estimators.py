@@ -15,7 +15,6 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.shards import Solver
-from cfx.calibration.windows import WindowSettings
 from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
@@ -31,6 +30,7 @@ from cfx.policies.features import Scaler, token_width
 from cfx.policies.heads import head_class
 from cfx.policies.heads.direct import DirectHead
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import WindowSettings
 from cfx_estimators.estimator import EstimatorPolicy
 from cfx_estimators.particle_filter import ParticleFilterPolicy, reweighted
 from cfx_estimators.recalibrate import RecalibratePolicy

@@ -4,7 +4,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfx.calibration.prior import squashed
+from cfx.core.parameters import squashed
 from cfx.models.krauss import Krauss
 from cfx.policies.heads.offset import NONE, moved, shrunk
 

@@ -18,7 +18,6 @@ import pandas as pd
 import pytest
 import torch
 
-from cfx.calibration.windows import WindowSettings
 from cfx.core import registry
 from cfx.core.errors import TrackingError
 from cfx.data.tidy import write_tidy
@@ -38,6 +37,7 @@ from cfx.results.store import download_run, quiet, translate_errors
 from cfx.results.table import Findings, Kept, ResultTable, WrittenTable
 from cfx.results.tables import Pairs
 from cfx.results.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
+from cfx.simulation.windows import WindowSettings
 from tests.drives import wavy_pairs
 from tests.made_up import MadeUp, make_curves, make_results
 

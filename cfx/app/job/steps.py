@@ -19,9 +19,8 @@ from cfx.calibration.identifiability import slices, training_errors
 from cfx.calibration.objectives.base import Objective
 from cfx.calibration.optimizers.base import Optimizer
 from cfx.calibration.prior import prior_weight
-from cfx.calibration.settings import CalibrationSettings, WindowSettings
+from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
-from cfx.calibration.windows import Split
 from cfx.core import registry
 from cfx.core.engine import Engine
 from cfx.core.errors import ConfigError, PluginError
@@ -45,7 +44,9 @@ from cfx.results.store import folder_of, is_run_id
 from cfx.results.table import Findings
 from cfx.simulation.memory import MemorySimulator
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.settings import WindowSettings
 from cfx.simulation.simulator import Simulator
+from cfx.simulation.windows import Split
 
 _CONSTANT = ("default", "population", "fixed")
 

@@ -18,8 +18,7 @@ from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.posterior import noise
-from cfx.calibration.prior import squashed
-from cfx.core.parameters import ParameterSpace
+from cfx.core.parameters import ParameterSpace, squashed
 from cfx.simulation.kernel.keys import ComponentKey
 
 DEVIATION = 1.5

@@ -20,9 +20,9 @@ from cfx.calibration.posterior.importance import sample
 from cfx.calibration.posterior.laplace import Normal, laplace, likely_starts
 from cfx.calibration.posterior.levels import LEVEL
 from cfx.calibration.posterior.population import Population, fit_population
-from cfx.calibration.prior import squashed
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
+from cfx.core.parameters import squashed
 from cfx.data.pairs import PairBatch
 from cfx.simulation.trajectory import Segments
 

@@ -12,7 +12,6 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
-from cfx.calibration.windows import Split
 from cfx.core.component import Distinct, Settings
 from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
@@ -26,6 +25,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.context import ContextRule, ExpectedError
 from cfx.policies.heads.offset import shrunk
 from cfx.policies.placement import ALL
+from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)
 

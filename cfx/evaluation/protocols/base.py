@@ -16,7 +16,6 @@ from torch import Tensor
 
 from cfx.calibration.calibrator import Calibrator, Labels
 from cfx.calibration.objectives.base import Objective
-from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.engine import Engine
@@ -35,6 +34,7 @@ from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.valid_range import recorded_quantiles
 from cfx.simulation.base import Stepper
+from cfx.simulation.windows import Windows, WindowSettings
 
 log = logging.getLogger(__name__)
 

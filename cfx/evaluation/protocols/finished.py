@@ -13,7 +13,6 @@ import pandas as pd
 import torch
 from pydantic import Field
 
-from cfx.calibration.windows import Split
 from cfx.core.component import Settings
 from cfx.core.errors import DataError
 from cfx.core.files import FilePath
@@ -24,6 +23,7 @@ from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
+from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)
 

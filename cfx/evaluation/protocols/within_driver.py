@@ -10,7 +10,6 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.calibration.windows import Split
 from cfx.core.component import Settings
 from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes
 from cfx.evaluation.evaluate import ComparedPairs, evaluate
@@ -23,6 +22,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy
 from cfx.policies.placement import ALL, group_by
+from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)
 

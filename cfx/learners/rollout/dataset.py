@@ -16,8 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cfx.calibration.prior import squashed
 from cfx.core import scratch
+from cfx.core.parameters import squashed
 from cfx.data.pairs import SIGNALS, PairBatch
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.inputs import RolloutBatch

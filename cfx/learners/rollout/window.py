@@ -25,7 +25,6 @@ import torch
 from torch import Tensor
 
 from cfx.calibration import prior
-from cfx.calibration.windows import WindowSettings
 from cfx.core import parameters
 from cfx.core.component import folder_hash
 from cfx.models.base import DrivingModel, Follower, Leader
@@ -35,6 +34,7 @@ from cfx.policies.features import History
 from cfx.simulation.kernel.compiler import torch_compiled
 from cfx.simulation.kernel.keys import component_code
 from cfx.simulation.step import advance_vehicle
+from cfx.simulation.windows import WindowSettings
 
 
 class LoopState(NamedTuple):

@@ -15,8 +15,7 @@ from typing import ClassVar, Self
 import torch
 from torch import Tensor
 
-from cfx.calibration.prior import squashed
-from cfx.core.parameters import ParameterSpace
+from cfx.core.parameters import ParameterSpace, squashed
 from cfx.models.base import DrivingModel
 from cfx.policies.heads.base import ParameterHead
 

@@ -17,12 +17,12 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from cfx.calibration.prior import squashed
-from cfx.calibration.settings import WindowSettings
 from cfx.core.errors import ConfigError
+from cfx.core.parameters import squashed
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, Summary
+from cfx.simulation.settings import WindowSettings
 from cfx.simulation.step import advance_vehicle
 
 _LARGEST = 6.0

@@ -16,8 +16,9 @@ from torch import Tensor
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives.base import Objective
 from cfx.calibration.optimizers.base import Optimizer
-from cfx.calibration.prior import Prior, squashed
+from cfx.calibration.prior import Prior
 from cfx.core.component import Settings
+from cfx.core.parameters import squashed
 from cfx.core.registry import create
 from cfx.policies.base import ResidualSettings
 from cfx.policies.features import History

@@ -16,7 +16,6 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.calibration.windows import Windows, WindowSettings
 from cfx.core.engine import Engine
 from cfx.core.errors import EngineError
 from cfx.core.local_engine import LocalEngine
@@ -24,6 +23,7 @@ from cfx.core.progress import Task
 from cfx.data.pairs import PairBatch
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Windows, WindowSettings
 from cfx_dask.engine.engine import DaskEngine
 from tests.core.engine.clusters import Cluster, meanwhile, running_cluster, until
 from tests.drives import wavy_pairs

@@ -18,7 +18,6 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.calibration.windows import Split, WindowSettings
 from cfx.contracts import protocols
 from cfx.core.errors import DataError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
@@ -33,6 +32,7 @@ from cfx.policies.features import History
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx.simulation.windows import Split, WindowSettings
 from tests.drives import straight_pairs, wavy_pairs
 
 QUICK = [

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.calibration.prior import squashed
+from cfx.core.parameters import squashed
 from cfx.learners.base import TrainingPairs
 from cfx.learners.rollout import dataset as dataset_module
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps

@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.calibration.prior import squashed
+from cfx.core.parameters import squashed
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
 from cfx.learners.rollout.inputs import RolloutBatch
 from cfx.learners.rollout.loop import burn_in, simulate

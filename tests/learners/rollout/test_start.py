@@ -9,13 +9,13 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.calibration.windows import WindowSettings
 from cfx.core.errors import ConfigError, DataError
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.models.w99 import W99
 from cfx.policies.checkpoint import save
 from cfx.policies.placement import ALL
+from cfx.simulation.windows import WindowSettings
 from tests.learners.made import QUICK, gru, loop, ready, training_data
 
 STILL = QUICK | {"epochs": 1, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0}

@@ -22,7 +22,6 @@ import torch
 from torch import Tensor
 
 from cfx import DrivingModel, Follower, Leader
-from cfx.calibration.settings import WindowSettings
 from cfx.core.errors import DataError, ParameterError, SumoError
 from cfx.core.job_folder import parse_json
 from cfx.core.registry import create
@@ -39,6 +38,7 @@ from cfx.policies.heads.direct import DirectHead
 from cfx.policies.placement import ALL
 from cfx.policies.valid_range import share_in_words
 from cfx.results.store import folder_of
+from cfx.simulation.settings import WindowSettings
 from cfx.simulation.step import advance_vehicle
 from cfx_sumo.live.braking import hardest_braking
 from cfx_sumo.live.clock import Clock

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cfx.calibration.settings import WindowSettings
 from cfx.core.errors import DataError
 from cfx.data.pairs import PairSet
+from cfx.simulation.settings import WindowSettings
 from cfx.simulation.trajectory import TRANSIENT_S
 
 __all__ = ["Split", "WindowSettings", "Windows"]

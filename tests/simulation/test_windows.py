@@ -5,10 +5,10 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfx.calibration.windows import Split, Windows, WindowSettings
 from cfx.core.component import validate
 from cfx.core.errors import ConfigError, DataError
 from cfx.data.pairs import PairSet
+from cfx.simulation.windows import Split, Windows, WindowSettings
 from tests.drives import straight_pairs
 
 
