@@ -186,17 +186,19 @@ class _Track:
         columns = torch.arange(1 - length, self.steps + 1, device=first.device)
         self._frames = first[:, None] + columns
         index = self._frames.clamp(min=0, max=batch.mask.shape[1] - 1)
-        self._leader_position = batch.leader_position.gather(1, index)
-        self._leader_speed = batch.leader_speed.gather(1, index)
-        self._leader_acceleration = batch.leader_acceleration.gather(1, index)
-        self._leader_length = batch.leader_length
+        self._leader = Leader(
+            batch.leader_position.gather(1, index),
+            batch.leader_speed.gather(1, index),
+            batch.leader_acceleration.gather(1, index),
+            batch.leader_length[:, None],
+        )
         self._position = batch.follower_position.gather(1, index)
         self.speed = batch.follower_speed.gather(1, index)
         self._acceleration = batch.follower_acceleration.gather(1, index)
         # The agent must see nothing measured of the follower from here on.
         for signal in (self._position, self.speed, self._acceleration):
             signal[:, self._now + 1 :] = torch.nan
-        self._gap = self._leader_position - batch.leader_length[:, None] - self._position
+        self._gap = self._leader.position - self._leader.length - self._position
 
     def now(self) -> tuple[Tensor, Tensor, Tensor]:
         """Returns the followers' last measured position, speed and acceleration, `(P,)` each."""
@@ -210,8 +212,8 @@ class _Track:
         """Returns the L frames up to step `begin`, `(P, L)` each."""
         recent = slice(begin, begin + self._length)
         return History(
-            self._leader_speed[:, recent],
-            self._leader_acceleration[:, recent],
+            self._leader.speed[:, recent],
+            self._leader.acceleration[:, recent],
             self.speed[:, recent],
             self._acceleration[:, recent],
             self._gap[:, recent],
@@ -221,10 +223,10 @@ class _Track:
         """Returns the leaders at steps `begin` to `end - 1`, time first."""
         ahead = slice(self._now + begin, self._now + end)
         return Leader(
-            self._leader_position[:, ahead].T,
-            self._leader_speed[:, ahead].T,
-            self._leader_acceleration[:, ahead].T,
-            self._leader_length,
+            self._leader.position[:, ahead].T,
+            self._leader.speed[:, ahead].T,
+            self._leader.acceleration[:, ahead].T,
+            self._leader.length[:, 0],
         )
 
     def write(self, begin: int, end: int, position: Tensor, speed: Tensor, dt: float) -> None:
@@ -234,7 +236,7 @@ class _Track:
         self._position[:, done] = position
         self.speed[:, done] = speed
         self._acceleration[:, done] = (self.speed[:, done] - self.speed[:, before]) / dt
-        leader_rear = self._leader_position[:, done] - self._leader_length[:, None]
+        leader_rear = self._leader.position[:, done] - self._leader.length
         self._gap[:, done] = leader_rear - self._position[:, done]
 
     def result(self) -> tuple[Tensor, Tensor, Tensor]:
