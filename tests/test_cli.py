@@ -307,12 +307,19 @@ def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) 
         assert run("--cfg", "job", override) == 0
 
 
-@pytest.mark.parametrize("command", registry.names("command"))
-def test_every_sub_command_is_in_the_help_and_is_the_advice_for_a_slip(
-    run: Run, command: str, capsys
-) -> None:
+def test_every_sub_command_is_in_the_help(run: Run, capsys) -> None:
     assert run("--help") == 0
-    assert f"cfx {command.replace('.', ' ')} " in capsys.readouterr().out
+    said = capsys.readouterr().out
+    missing = [
+        command
+        for command in registry.names("command")
+        if f"cfx {command.replace('.', ' ')} " not in said
+    ]
+    assert not missing
+
+
+@pytest.mark.parametrize("command", registry.names("command"))
+def test_a_sub_command_is_the_advice_for_a_slip(run: Run, command: str, capsys) -> None:
     slip = command + command[-1]
     assert run(slip) == 2
     assert f"Did you mean '{command}'?" in capsys.readouterr().err

@@ -53,6 +53,7 @@ def test_the_papers_experiments_train_as_the_paper_does(name: str) -> None:
     assert values["data"]["name"] == "tidy", "the command line's data wins over the experiment's"
 
 
+@pytest.mark.slow
 def test_an_experiment_sweeps_without_being_told(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

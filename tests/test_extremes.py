@@ -65,16 +65,18 @@ RECORDINGS = {
 }
 
 
-# An hour takes seven seconds for Krauss and twenty for Wiedemann 99: one model is tested always.
+MODELS = ("krauss", "w99", "idm")
+
+# Each recording is tested with one model always, and with the others by the slow tests.
 CASES = [
     pytest.param(
         recording,
         model,
-        marks=[pytest.mark.slow] if recording == "an hour" and model != "idm" else [],
+        marks=[] if model == MODELS[(number + 2) % 3] else [pytest.mark.slow],
         id=f"{recording}-{model}",
     )
-    for recording in RECORDINGS
-    for model in ("krauss", "w99", "idm")
+    for number, recording in enumerate(RECORDINGS)
+    for model in MODELS
 ]
 
 

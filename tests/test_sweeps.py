@@ -109,7 +109,7 @@ def summary(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("how", ["interrupt", "muddle"])
+@pytest.mark.parametrize("how", [pytest.param("interrupt", marks=pytest.mark.slow), "muddle"])
 def test_an_interrupted_sweep_goes_on_whatever_the_order_of_its_overrides(
     run: Run, how: str, capsys
 ) -> None:
@@ -161,6 +161,7 @@ def test_other_commands_have_folders_of_their_own(run: Run) -> None:
     assert len(sweeps()) == 3
 
 
+@pytest.mark.slow
 def test_a_sweep_that_an_experiment_file_asks_for_goes_on_too(run: Run) -> None:
     Path("mine/experiment").mkdir(parents=True)
     Path("mine/experiment/seeds.yaml").write_text(
@@ -425,7 +426,9 @@ def test_every_launcher_ends_what_was_broken_off(
     assert counts.total() <= JOBS + 2
 
 
-@pytest.mark.parametrize("killed", ["everything", "the main process"])
+@pytest.mark.parametrize(
+    "killed", ["everything", pytest.param("the main process", marks=pytest.mark.slow)]
+)
 def test_a_killed_sweep_of_worker_processes_is_made_up_for(
     run: Run, install, processes: list[Any], killed: str
 ) -> None:

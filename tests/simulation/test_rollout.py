@@ -314,6 +314,7 @@ def fresh_compiler() -> Iterator[None]:
     rollout._COMPILED.clear()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("fresh_compiler")
 def test_compiled_equals_eager_and_shapes_do_not_recompile(monkeypatch: pytest.MonkeyPatch) -> None:
     model = Krauss()

@@ -61,11 +61,11 @@ def driven(dt: float, **policy: Any) -> Motion:
 @pytest.mark.parametrize(
     ("dt", "speed", "gap"),
     [
-        (0.01, 0.05, 0.3),
+        pytest.param(0.01, 0.05, 0.3, marks=pytest.mark.slow),
         (0.05, 0.05, 0.3),
-        (0.2, 0.1, 0.5),
+        pytest.param(0.2, 0.1, 0.5, marks=pytest.mark.slow),
         (0.25, 0.2, 1.0),  # two steps of 0.125 s
-        (0.5, 0.2, 0.8),
+        pytest.param(0.5, 0.2, 0.8, marks=pytest.mark.slow),
         (1.0, 0.5, 2.0),
     ],
 )

@@ -683,10 +683,12 @@ def style_of(pairs: Sequence[Any]) -> StyleResult:
 @pytest.mark.parametrize(
     ("node", "length", "frames", "history", "driver_features", "residual"),
     [
-        ({"name": "krauss"}, 5, 250, 5.3, (), False),
+        pytest.param({"name": "krauss"}, 5, 250, 5.3, (), False, marks=pytest.mark.slow),
         ({"name": "w99"}, 5, 250, 5.3, (), True),
         ({"name": "krauss"}, 5, 250, 17.3, ("acceleration", "time_gap"), False),
-        ({"name": "w99"}, 8, 500, None, ("time_headway",), False),
+        pytest.param(
+            {"name": "w99"}, 8, 500, None, ("time_headway",), False, marks=pytest.mark.slow
+        ),
     ],
     ids=[
         "offsets from own parameters, after 5 s",

@@ -80,7 +80,10 @@ def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
 
 
 @needs_sumo
-@pytest.mark.parametrize(("how", "code"), [(signal.SIGTERM, 143), (signal.SIGKILL, -9)])
+@pytest.mark.parametrize(
+    ("how", "code"),
+    [(signal.SIGTERM, 143), pytest.param(signal.SIGKILL, -9, marks=pytest.mark.slow)],
+)
 def test_a_signal_ends_a_calibration_in_sumo_and_its_processes(
     how: signal.Signals, code: int, tmp_path: Path
 ) -> None:
@@ -128,6 +131,7 @@ def test_the_preset_of_eidm_is_what_sumo_knows(tmp_path: Path) -> None:
 
 
 @needs_sumo
+@pytest.mark.slow
 def test_a_policy_that_learned_drives_w99_in_sumo(tmp_path: Path) -> None:
     same = ["model=w99", "policy=gru", "learner.epochs=1"]
     memory = job(tmp_path / "memory", *same)

@@ -169,6 +169,7 @@ def test_a_delay_beyond_the_memory_is_refused_with_what_to_write() -> None:
         simulate(GippsDelay(), None, leader_of(0.04, 10), start(), 0.04)
 
 
+@pytest.mark.slow
 def test_a_policy_learns_by_rollout_through_the_delay(tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     result = cfx.run(

@@ -57,6 +57,7 @@ def driven(step: DriverStep) -> NDArray[np.float64]:
     return np.stack(rows)
 
 
+@pytest.mark.slow
 def test_a_stochastic_driver_drives_the_example_as_cfx_does(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -61,6 +61,7 @@ def test_the_demonstration_has_the_errors_of_the_evaluation(demo: Path) -> None:
     assert default["difference_gap"].max() < 1e-9
 
 
+@pytest.mark.slow
 def test_offsets_start_in_sumo_from_what_they_start_from_in_the_job(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -87,7 +87,9 @@ def red_lights_run(folder: Path) -> list[tuple[float, str]]:
     return found
 
 
-@pytest.mark.parametrize("way", ["a program of one's own", "cfx drive"])
+@pytest.mark.parametrize(
+    "way", [pytest.param("a program of one's own", marks=pytest.mark.slow), "cfx drive"]
+)
 def test_by_default_nobody_runs_a_red_light_passes_a_stop_or_collides(
     way: str, tmp_path: Path
 ) -> None:

@@ -44,6 +44,7 @@ def traffic(drawn: Path) -> TrafficProtocol:
     )
 
 
+@pytest.mark.slow
 def test_contract_with_a_finished_policy(traffic: TrafficProtocol) -> None:
     check_contract(traffic)
 

@@ -64,6 +64,7 @@ def test_it_learns_to_drive_like_the_drivers() -> None:
     assert curves.validation_loss.min() < 0.8 * curves.validation_loss.iloc[0]
 
 
+@pytest.mark.slow
 def test_a_residual_policy_starts_where_the_driver_is_and_drives_better() -> None:
     """It has exactly the driver's acceleration at first, trained or not."""
     policy, data = gru(), training_data(networks=1)
@@ -99,6 +100,7 @@ def test_it_minimises_the_objective_of_the_job(objective: Objective) -> None:
     _losses_of_objectives.append(losses)
 
 
+@pytest.mark.slow
 def test_driver_features_help_to_drive_more_like_each_driver() -> None:
     """All from one base and without history, so that nothing else tells drivers apart."""
     errors = []
@@ -228,6 +230,7 @@ def test_every_option_trains(options: dict[str, Any]) -> None:
     assert is_unvalidated == (options.get("validation") == 0.0)
 
 
+@pytest.mark.slow
 def test_w99_learns_through_smoothed_regimes_and_drives_exactly() -> None:
     """Exact thresholds have no gradient, smoothed ones do; the exact model drives better for it."""
     policy = LstmPolicy(inputs=INPUTS, hidden_size=12)
@@ -258,6 +261,7 @@ def test_patience_begins_after_distillation() -> None:
     assert curves.epoch.max() + 1 == 6
 
 
+@pytest.mark.slow
 def test_distillation_makes_a_policy_drive_better() -> None:
     """The validation loss is of the student's own trajectories; it learns from the expert alone."""
     policy, data = gru(), training_data(networks=1)

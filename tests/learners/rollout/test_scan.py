@@ -78,7 +78,13 @@ CASES = [
 
 
 @pytest.mark.parametrize(("model", "kind", "options", "settings"), CASES)
-@pytest.mark.parametrize("path", [ThroughTime(0.8, 0.5), ThroughTime(0.9, 1.0, cut_after=4)])
+@pytest.mark.parametrize(
+    "path",
+    [
+        pytest.param(ThroughTime(0.8, 0.5), marks=pytest.mark.slow),
+        ThroughTime(0.9, 1.0, cut_after=4),
+    ],
+)
 def test_losses_and_gradients_are_those_of_pytorch(
     model: DrivingModel, kind: Any, options: Any, settings: Any, path: ThroughTime
 ) -> None:

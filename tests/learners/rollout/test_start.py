@@ -32,6 +32,13 @@ def learned(folder: Path, ensemble_size: int = 2) -> TrainingResult:
     return result
 
 
+@pytest.fixture(scope="module")
+def one(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, TrainingResult]:
+    """A finished job with an ensemble of one: its folder and what it learned."""
+    folder = tmp_path_factory.mktemp("one")
+    return folder, learned(folder / "policy", ensemble_size=1)
+
+
 def node_of_policy() -> dict[str, Any]:
     return {"name": "gru", **gru().settings.model_dump()}
 
@@ -47,11 +54,11 @@ def test_without_a_step_they_drive_as_that_policy_does(tmp_path: Path) -> None:
 
 
 def test_each_network_of_a_training_begins_so_and_knows_what_that_one_had_seen(
-    tmp_path: Path,
+    one: tuple[Path, TrainingResult],
 ) -> None:
-    result = learned(tmp_path / "policy", ensemble_size=1)
+    folder, result = one
     data = training_data(networks=2)
-    options = STILL | {"start": f"{tmp_path}#all"}
+    options = STILL | {"start": f"{folder}#all"}
     found = RolloutLearner(**options).fit(gru(), data)
     for name, value in found.network.state_dict().items():
         for network in value:
@@ -70,20 +77,20 @@ def test_each_network_of_a_training_begins_so_and_knows_what_that_one_had_seen(
     ],
 )
 def test_a_policy_of_another_kind_is_refused(
-    tmp_path: Path, changes: dict[str, Any], message: str
+    one: tuple[Path, TrainingResult], changes: dict[str, Any], message: str
 ) -> None:
-    learned(tmp_path / "policy", ensemble_size=1)
     head = changes.pop("head", "offset")
     with pytest.raises(ConfigError, match=message):
-        RolloutLearner(**STILL, start=str(tmp_path), head=head).fit(
+        RolloutLearner(**STILL, start=str(one[0]), head=head).fit(
             gru(), training_data(networks=1, **changes)
         )
 
 
-def test_another_ensemble_and_a_missing_network_are_refused(tmp_path: Path) -> None:
-    learned(tmp_path / "policy", ensemble_size=1)
-    data = training_data(networks=1)
+def test_another_ensemble_and_a_missing_network_are_refused(
+    one: tuple[Path, TrainingResult],
+) -> None:
+    folder, data = one[0], training_data(networks=1)
     with pytest.raises(ConfigError, match=r"set learner\.ensemble_size=1"):
-        RolloutLearner(**(STILL | {"ensemble_size": 2}), start=str(tmp_path)).fit(gru(), data)
+        RolloutLearner(**(STILL | {"ensemble_size": 2}), start=str(folder)).fit(gru(), data)
     with pytest.raises(DataError, match="it has no network 'fold 7', but all"):
-        RolloutLearner(**STILL, start=f"{tmp_path}#fold 7").fit(gru(), data)
+        RolloutLearner(**STILL, start=f"{folder}#fold 7").fit(gru(), data)

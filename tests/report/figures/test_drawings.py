@@ -65,8 +65,8 @@ def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
 @pytest.mark.parametrize(
     ("options", "files"),
     [
-        ({"pairs": 1, "epochs": 1}, 10),
-        ({"pairs": 94, "frames": 40, "space": TEN}, 11),
+        pytest.param({"pairs": 1, "epochs": 1}, 10, marks=pytest.mark.slow),
+        pytest.param({"pairs": 94, "frames": 40, "space": TEN}, 11, marks=pytest.mark.slow),
         ({"pairs": 2, "frames": 1, "networks": 0}, 9),
         ({"pairs": 26, "methods": ("default", "population", "fixed", "policy")}, 11),
     ],
