@@ -69,6 +69,19 @@ RECIPES = {
         "Wiedemann 99 for drivers of any road, without history and with; Vissim's family.",
         EVERY_ROAD,
     ),
+    "krauss": Recipe(
+        (
+            "experiment=every_road",
+            "model=krauss",
+            "model.parameters.a.tuned=true",
+            "model.limits.response_time=0.3",
+            "learner.jerk_weight=0.01",
+            "protocol.combine=false",
+            *_ONE_NETWORK,
+        ),
+        "Krauss's model for drivers of any road, without history and with; SUMO's own family.",
+        EVERY_ROAD,
+    ),
     "i80-idm": Recipe(
         ("experiment=unseen_drivers", "model=idm", *_I80),
         "Intelligent Driver Model for unseen drivers; the smoothest, and the one to begin with.",
