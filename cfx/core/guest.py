@@ -78,10 +78,15 @@ def default_torch() -> Iterator[None]:
 
 @contextlib.contextmanager
 def visit() -> Iterator[None]:
-    """Runs a block that computes for a program: `guest` and `default_torch` together."""
+    """Runs a block that computes for a program: `guest` and `default_torch` together.
+
+    Bars of progress are drawn in notebooks alone.
+    """
     import torch  # noqa: F401 - a guest puts the state of what is there already back
 
-    with guest(), default_torch():
+    from cfx.core.progress import no_bars_on_terminals
+
+    with guest(), default_torch(), no_bars_on_terminals():
         yield
 
 
