@@ -168,3 +168,37 @@ def expect_tensor(
         f"{what} gives {value.dtype} for {dtype}; a component computes in the dtype of what it is"
         " given"
     )
+
+
+def expect_close(
+    value: Any,
+    expected: Any,
+    *,
+    msg: str,
+    rtol: float | None = None,
+    atol: float | None = None,
+    equal_nan: bool = False,
+) -> None:
+    """Asserts that two tensors agree in shape, dtype and numbers.
+
+    As `torch.testing.assert_close`, with its tolerances, which would import PyTorch's distributed
+    tensors and SymPy: a second of the start of every job.
+
+    Args:
+        value: what a component gives.
+        expected: what it must give.
+        msg: the sentence that says so.
+        rtol, atol: largest relative and absolute difference; None: PyTorch's for the dtype.
+        equal_nan: whether NaN agrees with NaN.
+    """
+    import torch
+
+    alike = value.shape == expected.shape and value.dtype == expected.dtype
+    usual = (1.3e-6, 1e-5) if value.dtype == torch.float32 else (1e-7, 1e-7)
+    assert alike and torch.allclose(  # noqa: PT018 - one sentence
+        value,
+        expected,
+        rtol=usual[0] if rtol is None else rtol,
+        atol=usual[1] if atol is None else atol,
+        equal_nan=equal_nan,
+    ), msg

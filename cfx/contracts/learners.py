@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
-from cfx.contracts.contract import contract_of
+from cfx.contracts.contract import contract_of, expect_close
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingPairs, TrainingResult
@@ -230,9 +230,7 @@ def networks_are_independent(learner: Learner) -> None:
     )
     for key in one:
         own = len(one[key]) // PAIRS  # rows of one network, more than one in an ensemble
-        torch.testing.assert_close(
-            one[key][own:], two[key][own:], rtol=1e-4, atol=1e-5, msg=f"{message} ({key})"
-        )
+        expect_close(one[key][own:], two[key][own:], rtol=1e-4, atol=1e-5, msg=f"{message} ({key})")
 
 
 def the_training_data_stays_as_it_is(learner: Learner) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of, expect_tensor
+from cfx.contracts.contract import NotApplicable, contract_of, expect_close, expect_tensor
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.metrics.base import Metric, Trajectories
 
@@ -126,7 +126,7 @@ def a_simulation_without_error_has_none(metric: Metric) -> None:
 
 
 def single_precision_agrees_with_double(metric: Metric) -> None:
-    torch.testing.assert_close(
+    expect_close(
         metric.compute(trajectories(torch.float32)).double(),
         metric.compute(trajectories()).double(),
         rtol=1e-3,
@@ -162,7 +162,7 @@ def _of_pairs(given: Trajectories, index: Tensor) -> Trajectories:
 
 
 def _same(values: Tensor, expected: Tensor, message: str) -> None:
-    torch.testing.assert_close(values, expected, rtol=1e-9, atol=1e-12, equal_nan=True, msg=message)
+    expect_close(values, expected, rtol=1e-9, atol=1e-12, equal_nan=True, msg=message)
 
 
 CONTRACT = contract_of(__name__, "metric", first=[a_metric_gives_one_number_for_each_pair])

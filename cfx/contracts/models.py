@@ -11,7 +11,7 @@ from typing import Literal, get_args, get_origin
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of, expect_tensor
+from cfx.contracts.contract import NotApplicable, contract_of, expect_close, expect_tensor
 from cfx.core.errors import CfxError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.rollout import simulate
@@ -187,7 +187,7 @@ def a_batch_equals_the_loop_over_it(model: DrivingModel) -> None:
     together = model.next_speed(follower, leader, p, DT)
     for k in range(DRIVES):
         alone = model.next_speed(*_pick(ordinary, k), DT)
-        torch.testing.assert_close(
+        expect_close(
             alone,
             together[k],
             msg=f"follower {k} moves differently alone than in a batch: results would depend on"
@@ -206,7 +206,7 @@ def leaders_and_parameters_broadcast(model: DrivingModel) -> None:
         " behind one leader"
     )
     one = model.next_speed(follower, leader, p, DT)
-    torch.testing.assert_close(
+    expect_close(
         speed,
         one[:, None].expand(DRIVES, 3),
         msg="broadcasting changes the numbers: a candidate must move the same beside others as"
@@ -352,7 +352,7 @@ def keeps_its_equilibrium(model: DrivingModel, equilibrium: Equilibrium | None =
     )
     calm = calm._replace(acceleration=torch.zeros_like(gap))
     ahead = leader._replace(acceleration=torch.zeros_like(gap))
-    torch.testing.assert_close(
+    expect_close(
         model.next_speed(calm, ahead, p, DT),
         leader.speed,
         msg="at the equilibrium gap and equal speeds the speed must stay",
@@ -399,7 +399,7 @@ def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
                 f" {str(error).strip().partition(chr(10))[0]}"
             ) from error
         eager = model.next_speed(follower, leader, p, DT)
-    torch.testing.assert_close(
+    expect_close(
         compiled,
         eager,
         msg="compiling the step changes its numbers: calibrations would find others",

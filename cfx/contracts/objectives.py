@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.objectives.base import FrameValues, Objective
-from cfx.contracts.contract import contract_of, expect_tensor
+from cfx.contracts.contract import contract_of, expect_close, expect_tensor
 
 FRAMES, PROBLEMS, CANDIDATES = 12, 3, 4
 DT = 0.1
@@ -110,7 +110,7 @@ def a_standing_driver_has_a_finite_loss(objective: Objective) -> None:
 def frames_that_do_not_count_change_nothing(objective: Objective) -> None:
     frames, counted = _frames(), _counted()
     changed = _changed(frames, lambda signal: torch.where(counted > 0, signal, 1e3))
-    torch.testing.assert_close(
+    expect_close(
         objective(changed, counted),
         objective(frames, counted),
         rtol=1e-9,
@@ -131,7 +131,7 @@ def a_batch_equals_the_loop_over_it(objective: Objective) -> None:
                 frames.measured_gap[:, p, 0],
                 DT,
             )
-            torch.testing.assert_close(
+            expect_close(
                 together[p, c],
                 objective(alone, counted[:, p, 0]),
                 msg="a trajectory's loss must not depend on what stands beside it in the batch",
@@ -142,7 +142,7 @@ def the_order_in_the_batch_does_not_matter(objective: Objective) -> None:
     frames, counted = _frames(), _counted()
     order = torch.tensor([2, 0, 1])
     moved = _changed(frames, lambda signal: signal[:, order])
-    torch.testing.assert_close(
+    expect_close(
         objective(moved, counted[:, order]),
         objective(frames, counted)[order],
         msg="a trajectory's loss must not depend on its place in the batch",
@@ -152,7 +152,7 @@ def the_order_in_the_batch_does_not_matter(objective: Objective) -> None:
 def time_may_be_any_dimension(objective: Objective) -> None:
     frames, counted = _frames(), _counted()
     last = _changed(frames, lambda signal: signal.movedim(0, -1))
-    torch.testing.assert_close(
+    expect_close(
         objective(last, counted.movedim(0, -1), dim=-1),
         objective(frames, counted),
         msg="terms work frame by frame: no operation may assume which dimension is time",
@@ -174,7 +174,7 @@ def parts_add_up_to_the_whole(objective: Objective) -> None:
         for total, term in zip(sums, step, strict=True):
             added.append(total + term)
         sums = tuple(added)
-    torch.testing.assert_close(
+    expect_close(
         objective.finish(sums, counted.sum(0)),
         objective(frames, counted),
         msg="sums that were accumulated frame by frame must give the loss of the whole trajectory",
@@ -188,7 +188,7 @@ def one_frame_needs_no_dimension_of_time(objective: Objective) -> None:
     assert isinstance(terms, tuple), "terms returns a tuple of tensors"
     assert len(terms) == len(whole), "terms returns as many tensors in every call"
     for one, many in zip(terms, whole, strict=True):
-        torch.testing.assert_close(
+        expect_close(
             one, many[0], msg="a rollout asks for the terms of one frame `(*batch,)` at a time"
         )
 
@@ -196,7 +196,7 @@ def one_frame_needs_no_dimension_of_time(objective: Objective) -> None:
 def float32_agrees_with_float64(objective: Objective) -> None:
     single = objective(_frames(torch.float32), _counted(torch.float32))
     expect_tensor(single, "finish", (PROBLEMS, CANDIDATES), torch.float32, "(*batch,)")
-    torch.testing.assert_close(
+    expect_close(
         single.double(),
         objective(_frames(), _counted()),
         rtol=1e-4,

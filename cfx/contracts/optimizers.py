@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.optimizers.base import CandidateLosses, Optimizer, Solution
-from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.contracts.contract import NotApplicable, contract_of, expect_close
 from cfx.core.errors import PluginError
 
 Function = Callable[[Tensor, Tensor], Tensor]
@@ -176,7 +176,7 @@ def survives_duplicate_guesses(optimizer: Optimizer) -> None:
     optima = _random(3, 2, seed=5)
     guesses = optima[:, None].expand(-1, 3, -1)
     found = optimizer.minimize(Problems(distance, optima), guesses, seed=1)
-    torch.testing.assert_close(
+    expect_close(
         found.best,
         optima,
         msg="the guesses were the optimum, so it must be returned: what was evaluated and what is"
@@ -254,12 +254,8 @@ def problems_are_independent(optimizer: Optimizer) -> None:
     for function in (distance, bowl, some_nan):
         together = optimizer.minimize(Problems(function, optima), guesses, seed=1)
         alone = optimizer.minimize(Problems(function, optima[3:7]), guesses[3:7], seed=1)
-        torch.testing.assert_close(
-            alone.loss, together.loss[3:7], rtol=1e-3, atol=1e-6, msg=message
-        )
-        torch.testing.assert_close(
-            alone.best, together.best[3:7], rtol=1e-3, atol=1e-4, msg=message
-        )
+        expect_close(alone.loss, together.loss[3:7], rtol=1e-3, atol=1e-6, msg=message)
+        expect_close(alone.best, together.best[3:7], rtol=1e-3, atol=1e-4, msg=message)
 
 
 def chunks_change_nothing(optimizer: Optimizer) -> None:
@@ -269,8 +265,8 @@ def chunks_change_nothing(optimizer: Optimizer) -> None:
     message = (
         "the memory bound decides on how many problems are solved at once, never on the result"
     )
-    torch.testing.assert_close(pieces.best, whole.best, rtol=1e-3, atol=1e-4, msg=message)
-    torch.testing.assert_close(pieces.filling, whole.filling, msg=message)
+    expect_close(pieces.best, whole.best, rtol=1e-3, atol=1e-4, msg=message)
+    expect_close(pieces.filling, whole.filling, msg=message)
 
 
 def evaluates_exactly_what_it_says(optimizer: Optimizer) -> None:
@@ -318,7 +314,7 @@ def ties_go_to_the_first_guess(optimizer: Optimizer) -> None:
 def returns_the_loss_of_what_it_returns(optimizer: Optimizer) -> None:
     problems, guesses = Problems(bowl, _random(4, 3, seed=5)), _random(4, 2, 3, seed=6)
     found = optimizer.minimize(problems, guesses, seed=1)
-    torch.testing.assert_close(
+    expect_close(
         problems(found.best[:, None])[:, 0],
         found.loss,
         msg="`loss` must be the loss of `best`: candidates and losses that are returned belong"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import contract_of, expect_tensor
+from cfx.contracts.contract import contract_of, expect_close, expect_tensor
 from cfx.models.idm import IDM
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width
@@ -81,8 +81,8 @@ def streaming_equals_the_whole_sequence(policy: Policy) -> None:
     message = (
         "training reads whole sequences, simulation one window at a time: both must give the same"
     )
-    torch.testing.assert_close(torch.cat(pieces, dim=2), whole, msg=message)
-    torch.testing.assert_close(state, last, msg=message)
+    expect_close(torch.cat(pieces, dim=2), whole, msg=message)
+    expect_close(state, last, msg=message)
 
 
 def a_policy_does_not_look_ahead(policy: Policy) -> None:
@@ -105,7 +105,7 @@ def networks_are_independent(policy: Policy) -> None:
     changed[0] += 1.0
     before, _ = network(tokens, network.initial_state(NETWORKS, DRIVERS))
     after, _ = network(changed, network.initial_state(NETWORKS, DRIVERS))
-    torch.testing.assert_close(
+    expect_close(
         before[1:],
         after[1:],
         msg="network i must read only slice i of its tokens: drivers would learn from one another",

@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of, expect_tensor
+from cfx.contracts.contract import NotApplicable, contract_of, expect_close, expect_tensor
 from cfx.core.errors import CfxError, ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm_sumo import IdmSumo
@@ -386,7 +386,7 @@ def _on_signals(leader: Leader, change: Callable[[Tensor], Tensor]) -> Leader:
 
 
 def _close(value: Tensor, expected: Tensor, sentence: str) -> None:
-    torch.testing.assert_close(value, expected, rtol=0.0, atol=TOLERANCE, msg=sentence)
+    expect_close(value, expected, rtol=0.0, atol=TOLERANCE, msg=sentence)
 
 
 CONTRACT = contract_of(

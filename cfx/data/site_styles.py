@@ -78,10 +78,13 @@ def styles_by_site(style: StyleResult) -> pd.DataFrame | None:
         `score_q75`, and the median of each indicator under its name (SI units). None where there
         is one site alone.
     """
-    from scipy import stats  # slow to import
+    found = groups(style.table)
+    if not found:
+        return None
+    from scipy import stats  # slow to import: only where there is something to summarise
 
     rows: list[dict[str, object]] = []
-    for group in groups(style.table):
+    for group in found:
         table = style.table[group.chosen]
         score = table["score"].to_numpy(dtype=np.float64)
         low = high = float("nan")
@@ -103,7 +106,7 @@ def styles_by_site(style: StyleResult) -> pd.DataFrame | None:
         for indicator in INDICATORS:
             row[indicator.name] = float(table[indicator.name].median())
         rows.append(row)
-    return pd.DataFrame(rows) if rows else None
+    return pd.DataFrame(rows)
 
 
 def style_distances(style: StyleResult) -> pd.DataFrame | None:
@@ -120,13 +123,16 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
         most, and `distance_INDICATOR`. Groups of fewer than two drivers are left out. None where
         there is nothing to compare.
     """
-    from scipy import stats  # slow to import
+    compared = list(_compared(style.table))
+    if not compared:
+        return None
+    from scipy import stats  # slow to import: only where there is something to compare
 
     scaled = normalise(style.table[[one.name for one in INDICATORS]].to_numpy(dtype=np.float64))
     weighted = scaled * np.array([style.weights[one.name] for one in INDICATORS])
     score = style.table["score"].to_numpy(dtype=np.float64)
     rows: list[dict[str, object]] = []
-    for one, other in _compared(style.table):
+    for one, other in compared:
         first, second = one.chosen & ~other.chosen, other.chosen & ~one.chosen
         if min(first.sum(), second.sum()) < _FEWEST:
             continue

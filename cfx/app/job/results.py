@@ -19,7 +19,6 @@ from cfx.data.style import StyleResult
 from cfx.evaluation.headline import headline, improvement_key
 from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.statistics import STATISTICS
-from cfx.figures.write import as_html
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.ready import is_ready_made
@@ -205,6 +204,8 @@ class JobResult:
         return f"JobResult({', '.join(said)},\n  {folder})"
 
     def _repr_html_(self) -> str:
+        from cfx.figures.write import as_html
+
         rows = {}
         for method in self.pairs["method"].unique() if "method" in self.pairs else ():
             of_method = self.pairs[self.pairs["method"] == method]
