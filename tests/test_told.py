@@ -59,12 +59,12 @@ def test_the_advice_to_use_a_file_can_be_pasted(tmp_path: Path) -> None:
 def test_missing_columns_say_what_gap_m_spares(tmp_path: Path) -> None:
     path = tmp_path / "pairs.csv"
     pairs = wavy_pairs(Krauss(), TRUE, frames=60)
-    kept = frame_of(pairs).drop(columns=["frame", "leader_position_m", "leader_length_m"])
+    kept = frame_of(pairs).drop(columns=["time_s", "leader_position_m", "leader_length_m"])
     kept.to_csv(path, index=False)
     with pytest.raises(DataError) as error:
         read_tidy(path)
     said = str(error.value)
-    assert "column frame is missing" in said
+    assert "column time_s is missing" in said
     assert "leader_position_m, leader_length_m" in said
     assert "not needed beside a column gap_m" in said
 

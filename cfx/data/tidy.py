@@ -4,8 +4,9 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 
 | column | unit | meaning |
 | --- | --- | --- |
-| `recording`, `pair_id` | | names; a pair id is unique in the file |
-| `leader_id`, `follower_id`, `frame` | | as in the source; frames are consecutive |
+| `pair_id` | | a name, unique in the file |
+| `recording`, `leader_id`, `follower_id` | | optional names, as in the source |
+| `frame` | | optional; frames are consecutive |
 | `time_s` | s | |
 | `leader_position_m`, `follower_position_m` | m | front bumper, along the lane |
 | `leader_speed_mps`, `follower_speed_mps` | m/s | |
@@ -17,6 +18,9 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 | `vehicle` | | optional: the follower's name over all recordings, where it has one |
 | `lane` | | optional, one value for each pair |
 | `true_model`, `true_NAME` | | optional: a synthetic driver's model and its parameters over time |
+
+Without `recording` a file is one, without `follower_id` each pair is a driver of its own, without
+`frame` a pair's rows are in the order of their times.
 
 A file may call these otherwise and have other units: see `cfx.data.own_columns`.
 
@@ -62,7 +66,7 @@ from cfx.data.table import Column, Layout, Table, read_table, table_of
 from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, check_gap, time_steps
 
 LABELS = ("recording", "pair_id", "leader_id", "follower_id")
-"""Columns of names that every file has."""
+"""Columns of names that every pair has."""
 
 SIGNAL_COLUMNS = {
     "leader_position": "leader_position_m",
@@ -84,8 +88,13 @@ _REVERSING = "is negative; speeds count along the lane and must be 0 or more"
 LAYOUT = Layout(
     name="the tidy layout",
     columns=(
-        *[Column(name, is_name=True) for name in LABELS],
-        Column("frame", whole=True, wrong="is no whole number; number the frames 0, 1, 2, ..."),
+        *[Column(name, is_name=True, needed=name == "pair_id") for name in LABELS],
+        Column(
+            "frame",
+            needed=False,
+            whole=True,
+            wrong="is no whole number; number the frames 0, 1, 2, ...",
+        ),
         Column("time_s", "s"),
         Column("leader_position_m", "m", unless=GAP),
         Column("leader_speed_mps", "m/s", least=0, wrong=_REVERSING),

@@ -5,8 +5,10 @@ What single cells may hold is declared in `cfx.data.tidy.LAYOUT`.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,8 +18,10 @@ from cfx.core.errors import DataError
 from cfx.data.files import Floats, Ints
 from cfx.data.kinematics import contradiction
 from cfx.data.pairs import Pair
-from cfx.data.table import Table
+from cfx.data.table import Labels, Table
 from cfx.data.tracks import accelerations, driven
+
+log = logging.getLogger(__name__)
 
 Marks = NDArray[np.bool_]
 
@@ -33,17 +37,48 @@ def check(table: Table) -> tuple[Table, Ints, Ints]:
     """Checks everything that the layout asks for.
 
     Returns:
-        The table, completed where it has gaps in place of other columns; the order `(N,)` that
+        The table, completed where columns were left out; the order `(N,)` that
         sorts the rows by pair (as they first appear) and frame; and where in it each pair begins.
 
     Raises:
         DataError: names file, row and column.
     """
+    table = _with_names_and_frames(table)
     order, starts = _check_frames(table)
     _check_pairs(table, order, starts)
     if GAP in table.numbers:
         table = with_positions(table, order, starts)
     return table, order, starts
+
+
+def _with_names_and_frames(table: Table) -> Table:
+    """Returns a table that says of what recording, who, behind whom and when each row is."""
+    labels, numbers = dict(table.labels), dict(table.numbers)
+    pair = labels["pair_id"]
+    if "recording" not in labels:
+        name = Path(table.source).name.partition(".")[0]
+        labels["recording"] = Labels(np.zeros(len(table), dtype=np.int64), [name])
+    if "follower_id" not in labels:
+        log.warning(
+            "%s: without a column %s each pair counts as a driver of its own",
+            table.source,
+            table.title("follower_id"),
+        )
+        labels["follower_id"] = pair
+    if "leader_id" not in labels:
+        labels["leader_id"] = Labels(pair.codes, [f"ahead of {name}" for name in pair.names])
+    if "frame" not in numbers:
+        time = numbers["time_s"]
+        order = np.lexsort((time, pair.codes))
+        starts = np.flatnonzero(np.append(True, np.diff(pair.codes[order]) != 0))
+        sizes = _sizes(order, starts)
+        steps = time_steps(time[order], starts)
+        # Single rows and repeated times, which are refused, have no step.
+        first = np.round(time[order][starts] / np.where(steps > 0, steps, 1.0))
+        numbers["frame"] = np.empty(len(table))
+        within = np.arange(len(table)) - np.repeat(starts, sizes)
+        numbers["frame"][order] = np.repeat(first, sizes) + within
+    return replace(table, labels=labels, numbers=numbers)
 
 
 def _check_frames(table: Table) -> tuple[Ints, Ints]:
@@ -179,7 +214,7 @@ def time_steps(time: Floats, starts: Ints) -> Floats:
         starts: where each pair begins.
     """
     ends = np.append(starts[1:], len(time)) - 1
-    mean: Floats = (time[ends] - time[starts]) / (ends - starts)
+    mean: Floats = (time[ends] - time[starts]) / np.maximum(ends - starts, 1)
     return mean
 
 

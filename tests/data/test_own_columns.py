@@ -70,6 +70,25 @@ def test_the_pairs_are_those_of_the_layout(tmp_path: Path) -> None:
                 np.testing.assert_allclose(getattr(one, signal), getattr(other, signal), rtol=1e-9)
 
 
+def test_names_and_frames_may_be_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    short = table().drop(columns=["recording", "leader_id", "follower_id", "frame"])
+    found = load(written(tmp_path, short.sample(frac=1.0, random_state=0)))
+    by_name = {pair.pair_id: pair for pair in found}
+    for other in PAIRS:
+        one = by_name[other.pair_id]
+        np.testing.assert_allclose(one.gap, other.gap, rtol=1e-9)
+        assert (one.recording, one.first_frame) == ("own", other.first_frame)
+    assert len({pair.driver for pair in found}) == len(PAIRS)
+    assert not {pair.leader_id for pair in found} & {pair.follower_id for pair in found}
+    assert "each pair counts as a driver of its own" in caplog.text
+
+
+def test_a_time_that_stands_twice_is_refused_without_frames(tmp_path: Path) -> None:
+    short = table().drop(columns="frame")
+    with pytest.raises(DataError, match="time does not advance"):
+        load(written(tmp_path, pd.concat([short, short.iloc[[5]]])))
+
+
 def test_a_table_is_read_as_a_file(tmp_path: Path) -> None:
     layout = own_layout(LAYOUT, OwnColumns(**COLUMNS), OwnUnits(**UNITS))
     found = pairs_from_frame(table(), layout=layout)
