@@ -58,7 +58,17 @@ def test_intervals_stand_beside_the_same_point_estimates(
         middle = draws[f"parameter_{name}"].median()[rows["pair_id"]].to_numpy()
         assert (rows[f"low_{name}"] < middle).all()
         assert (middle < rows[f"high_{name}"]).all()
+    prior = pd.read_parquet("known/prior.parquet")
+    for name in known.evaluation.names:
+        before = prior[f"parameter_{name}"].quantile([0.05, 0.95]).diff().iloc[1]
+        assert (rows[f"high_{name}"] - rows[f"low_{name}"]).min() < before
     assert not Path("known/population.parquet").exists()
+    fan = pd.read_parquet("known/fan.parquet").groupby("pair_id")
+    assert fan.size().tolist() == [39, 39, 39]  # frames 10, 20, ... 390 of 0 to 399
+    for _, own in fan:
+        assert (own["low"] <= own["median"]).all()
+        assert (own["median"] <= own["high"]).all()
+        assert own["calibrated_on"].tolist() == [True] * 31 + [False] * 8  # up to frame 319
     assert "noise_scale" not in pd.read_parquet("plain/fits.parquet")
 
 
@@ -80,11 +90,12 @@ def test_a_population_as_the_prior_leaves_less_doubt() -> None:
 
 def test_intervals_that_are_not_to_be_relied_on_are_named() -> None:
     fits = {"pair_id": ["a", "b"], "method": "fixed", "noise_scale": 0.1, "noise_left": 0.0}
-    rows = pd.DataFrame({**fits, "pareto_k": [0.3, 0.8], "effective_samples": [500.0, 20.0]})
+    rows = pd.DataFrame({**fits, "pareto_k": [0.3, 0.8], "effective_samples": [60.0, 20.0]})
     known = KnownParameters(rows, ())
     assert known.metrics()["posterior/reliable"] == 0.5
     said = [str(one) for one in known.printed() if isinstance(one, Text)]
     assert said[0].startswith("Do not rely on the intervals of 1 of 2 pairs (b):")
+    assert said[1].startswith("The intervals of 1 of 2 pairs rest on fewer than 100 independent")
 
 
 def test_another_simulator_is_refused() -> None:

@@ -25,6 +25,8 @@ _KINDS = (
 )
 """Words, whose colour, and opacity of each kind of interval."""
 
+_BEFORE, _AFTER = "before the recording", "after the recording"
+
 
 def interval_rows(fits: pd.DataFrame) -> pd.DataFrame:
     """Returns the rows of a job's table `fits` that have intervals."""
@@ -93,13 +95,19 @@ def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
 
 
 @styled
-def draw_pairs(pair_id: str, draws: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
+def draw_pairs(
+    pair_id: str,
+    draws: pd.DataFrame,
+    axes: Sequence[ParameterAxis],
+    prior: pd.DataFrame | None = None,
+) -> Figure:
     """Draws a driver's draws of each two parameters, within the bounds.
 
     Args:
         pair_id: of the driver's pair.
         draws: a row per draw, with a column `parameter_NAME` for each parameter.
         axes: the tuned parameters.
+        prior: the same before the recording is seen.
     """
     count = len(axes)
     figure = canvas(1.0 + 1.15 * count, 2.0 + 1.3 * count)
@@ -110,14 +118,13 @@ def draw_pairs(pair_id: str, draws: pd.DataFrame, axes: Sequence[ParameterAxis])
             if column > row:
                 place.set_visible(False)
                 continue
-            across = draws[f"parameter_{horizontal.name}"].to_numpy(dtype=float)
             _limits(place.set_xlim, horizontal)
             if column == row:
-                place.hist(across, bins=20, color=colour_of("fixed"))
-                place.set_yticks([])
+                _densities(place, draws, prior, horizontal)
             else:
-                along = draws[f"parameter_{vertical.name}"].to_numpy(dtype=float)
-                place.plot(across, along, ".", color=colour_of("fixed"), alpha=0.4, markersize=2.5)
+                if prior is not None:
+                    _scatter(place, prior.head(len(draws)), horizontal, vertical, "default")
+                _scatter(place, draws, horizontal, vertical, "fixed")
                 _limits(place.set_ylim, vertical)
                 place.yaxis.set_major_locator(MaxNLocator(3))
             place.xaxis.set_major_locator(MaxNLocator(3))
@@ -127,8 +134,70 @@ def draw_pairs(pair_id: str, draws: pd.DataFrame, axes: Sequence[ParameterAxis])
         named = unit_label(axis.name, axis.unit)
         grid[-1, number].set_xlabel(named, fontsize=points(9))
         grid[number, 0].set_ylabel(named if number else "draws", fontsize=points(9))
+    handles, _ = grid[0, 0].get_legend_handles_labels()
+    legend_above(figure, handles)
     said = wrapped(f"{short(pair_id)}: {plural(len(draws), 'draw')} from the posterior")
     figure.supxlabel(said, fontsize=points(10.5), color=INK)
+    return figure
+
+
+def _scatter(
+    place: Axes, rows: pd.DataFrame, horizontal: ParameterAxis, vertical: ParameterAxis, method: str
+) -> None:
+    across = rows[f"parameter_{horizontal.name}"].to_numpy(dtype=float)
+    along = rows[f"parameter_{vertical.name}"].to_numpy(dtype=float)
+    place.plot(across, along, ".", color=colour_of(method), alpha=0.4, markersize=2.5)
+
+
+def _densities(
+    place: Axes, draws: pd.DataFrame, prior: pd.DataFrame | None, axis: ParameterAxis
+) -> None:
+    """Draws how likely values of one parameter are, before and after the recording."""
+    name = f"parameter_{axis.name}"
+    both = draws[name] if prior is None else pd.concat([draws[name], prior[name]])
+    edges = np.histogram_bin_edges(both.to_numpy(dtype=float), bins=30).tolist()
+    place.hist(draws[name], bins=edges, density=True, color=colour_of("fixed"), label=_AFTER)
+    if prior is not None:
+        colour = colour_of("default")
+        place.hist(
+            prior[name], bins=edges, density=True, histtype="step", color=colour, label=_BEFORE
+        )
+    place.set_yticks([])
+
+
+@styled
+def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
+    """Draws the fan of a driver's trajectories, and what was recorded.
+
+    Args:
+        pair_id: of the driver's pair.
+        rows: of the table `fan`.
+    """
+    figure = canvas(3.6)
+    place = figure.subplots()
+    time = rows["time_s"].to_numpy(dtype=float)
+    low, middle, high, measured = (
+        rows[name].to_numpy(dtype=float) for name in ("low", "median", "high", "measured")
+    )
+    colour = colour_of("fixed")
+    place.fill_between(
+        time, low, high, color=colour, alpha=0.3, linewidth=0, label=f"{LEVEL:.0%} of trajectories"
+    )
+    place.plot(time, middle, color=colour, label="median")
+    place.plot(time, measured, color=INK, label="recorded")
+    after = ~rows["calibrated_on"].to_numpy(dtype=bool)
+    if after.any():
+        held = (low <= measured) & (measured <= high)
+        place.axvline(time[after][0], color=EDGE, linestyle="--", linewidth=1)
+        say = f"{short(pair_id)}: {held[after].mean():.0%} of the steps after the dashed line held"
+    else:
+        say = short(pair_id)
+    place.set_xlabel("time from the start of the pair (s)")
+    signal = str(rows["signal"].iloc[0])
+    place.set_ylabel(unit_label(signal, {"speed": "m/s", "gap": "m"}[signal]))
+    handles, _ = place.get_legend_handles_labels()
+    legend_above(figure, handles)
+    figure.supxlabel(wrapped(say), fontsize=points(10.5), color=INK)
     return figure
 
 
@@ -171,8 +240,9 @@ class PosteriorPairs(JobFigure):
     title = "The posterior of one driver's parameters"
     caption = (
         "Draws from the posterior of the pair whose parameters are known about as well as those of"
-        " half of the pairs. A narrow diagonal band: the recording determines a combination of both"
-        " parameters, but not each."
+        " half of the pairs, and what was likely before the recording. A narrow diagonal band: the"
+        " recording determines a combination of both parameters, but not each. Where both look"
+        " alike, it says nothing."
     )
     order = 134
 
@@ -184,4 +254,26 @@ class PosteriorPairs(JobFigure):
         pair_id = _middle(interval_rows(fits))
         own = draws[draws["pair_id"].astype(str) == pair_id]
         axes = [axis for axis in results.parameters if f"parameter_{axis.name}" in own]
-        return draw_pairs(pair_id, own, axes) if len(own) and axes else None
+        prior = results.tables.get("population", results.tables.get("prior"))
+        return draw_pairs(pair_id, own, axes, prior) if len(own) and axes else None
+
+
+class PosteriorFan(JobFigure):
+    """What one driver's posterior says of their trajectory."""
+
+    title = "Trajectories of one driver's posterior"
+    caption = (
+        f"The middle {LEVEL:.0%} of the trajectories of the same driver's posterior, and what was"
+        " recorded. Up to the dashed line they are simulated, on the part that was calibrated on."
+        " After it they are forecasts, with noise that goes on from the last error."
+    )
+    order = 135
+
+    def draw(self, results: Results) -> Figure | None:
+        """Draws it where the job has a posterior."""
+        fits, fan = results.tables.get("fits"), results.tables.get("fan")
+        if fits is None or fan is None or interval_rows(fits).empty:
+            return None
+        pair_id = _middle(interval_rows(fits))
+        own = fan[fan["pair_id"].astype(str) == pair_id]
+        return draw_fan(pair_id, own) if len(own) else None

@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from cfx.calibration.posterior.levels import DETERMINED, LEVEL, RELIABLE
+from cfx.calibration.posterior.levels import DETERMINED, ENOUGH, LEVEL, RELIABLE
 from cfx.core.parameters import Parameter
 from cfx.results.table import Findings
 
@@ -87,11 +87,17 @@ class KnownParameters:
         pairs = len(self.rows)
         doubtful = list(self.rows["pair_id"][~self.reliable])
         if doubtful:
-            few = ", ".join(map(str, doubtful[:3])) + (" ..." if len(doubtful) > 3 else "")
+            named = ", ".join(map(str, doubtful[:3])) + (" ..." if len(doubtful) > 3 else "")
             sentences.append(
-                f"Do not rely on the intervals of {len(doubtful)} of {pairs} pairs ({few}):"
+                f"Do not rely on the intervals of {len(doubtful)} of {pairs} pairs ({named}):"
                 f" samples of these posteriors do not settle (pareto_k above {RELIABLE} in"
                 " fits.parquet), and such intervals are too narrow."
+            )
+        few = int((self.reliable & (self.rows["effective_samples"] < ENOUGH)).sum())
+        if few:
+            sentences.append(
+                f"The intervals of {few} of {pairs} pairs rest on fewer than {ENOUGH:.0f}"
+                " independent samples (effective_samples in fits.parquet): their ends are rough."
             )
         open_ones = []
         for one in self.parameters:

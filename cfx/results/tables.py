@@ -333,6 +333,37 @@ class PopulationDraws(ResultTable):
     columns = (Column("parameter_NAME", "as of the parameter", "the parameter"),)
 
 
+class PriorDraws(ResultTable):
+    """Parameters of drivers before their recordings are seen."""
+
+    meaning = (
+        "parameters as likely as they are before a driver's recording is seen"
+        " (`calibration.posterior=laplace`)"
+    )
+    order = 213
+    columns = (Column("parameter_NAME", "as of the parameter", "the parameter"),)
+
+
+class Fan(ResultTable):
+    """What posteriors say of trajectories."""
+
+    meaning = (
+        "90 % of the trajectories of each driver's posterior: simulated on the part that was"
+        " calibrated on, then forecasts (`calibration.posterior`)"
+    )
+    order = 214
+    columns = (
+        PAIR,
+        Column("time_s", "s", "since the recording's start"),
+        Column("calibrated_on", "1", "whether this part was calibrated on", "bool"),
+        Column("signal", "", "`speed` (m/s) or `gap` (m)", "text"),
+        Column("measured", "m/s or m", "what was recorded"),
+        Column("low", "m/s or m", "5 % are below"),
+        Column("median", "m/s or m", "half are below"),
+        Column("high", "m/s or m", "5 % are above"),
+    )
+
+
 def history_metrics(history: pd.DataFrame) -> dict[str, float]:
     """Return `history/BASE/AMOUNT/rmse_improvement`, means over pairs.
 

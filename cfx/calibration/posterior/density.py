@@ -95,6 +95,17 @@ class ParameterPrior:
         found: Tensor = self.center.reshape(-1, n).mean(0) + normal * deviation
         return found
 
+    def draw(self, drivers: int, n: int, *, seed: int) -> Tensor:
+        """Returns logits of drivers before their recordings, `(drivers, n)`."""
+        generator = torch.Generator().manual_seed(seed)
+        if self.center is None:
+            places = torch.rand((drivers, n), generator=generator, dtype=torch.float64)
+            return torch.logit(places, eps=1e-12)
+        normal = torch.randn((drivers, n), generator=generator, dtype=torch.float64)
+        factor = torch.linalg.cholesky(torch.linalg.inv(self.precision))
+        found: Tensor = self.center + normal @ factor.mT
+        return found
+
     def cut(self, drivers: Tensor) -> ParameterPrior:
         """Returns the prior of some drivers."""
         if self.center is None or self.center.dim() == 1:

@@ -6,7 +6,7 @@ Shapes: P drivers, n tuned parameters.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,7 @@ from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.posterior.density import ParameterPrior, Posterior
+from cfx.calibration.posterior.fan import Fan, fan_of
 from cfx.calibration.posterior.importance import sample
 from cfx.calibration.posterior.laplace import Normal, laplace, likely_starts
 from cfx.calibration.posterior.levels import LEVEL
@@ -29,7 +30,7 @@ from cfx.simulation.trajectory import Segments
 _SHARES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
 
 NEW_DRIVERS = 1000
-"""Drivers that are drawn from a population and kept."""
+"""Drivers that are drawn from a prior or a population and kept."""
 
 _WORK = 10**8
 """Vehicle steps that belong together: enough for a compiled kernel."""
@@ -60,6 +61,8 @@ class ParameterIntervals:
         effective_samples: `(P,)`, effective sample size that the quantiles rest on.
         pareto_k: `(P,)`, above 0.7 the intervals are not to be relied on.
         draws: parameters, `(P, DRAWS, n)`, SI units: as correlated as a recording leaves them.
+        prior: parameters of drivers who have no recording, `(NEW_DRIVERS, n)`, SI units.
+        fan: of trajectories.
         population: from which all drivers come, if it was asked for.
     """
 
@@ -74,6 +77,8 @@ class ParameterIntervals:
     effective_samples: Tensor
     pareto_k: Tensor
     draws: Tensor
+    prior: Tensor
+    fan: Fan
     population: Population | None = None
 
     def columns(self) -> dict[str, NDArray[np.float64]]:
@@ -87,9 +92,9 @@ class ParameterIntervals:
         return found
 
     def tables(self, ids: Sequence[str], seed: int) -> dict[str, pd.DataFrame]:
-        """Returns `posterior`, draws of each driver's parameters, and `population`, new drivers.
+        """Returns `posterior`, draws of each driver's parameters, `prior` and `fan`.
 
-        The second is there only where a population was asked for.
+        Where a population was asked for, `population`, new drivers of it, stands for `prior`.
 
         Args:
             ids: of the pairs.
@@ -100,8 +105,10 @@ class ParameterIntervals:
         values = pd.DataFrame(self.draws.flatten(0, 1).numpy(), columns=columns)
         values.insert(0, "pair_id", np.repeat(np.asarray(ids, dtype=object), draws))
         values.insert(1, "draw", np.tile(np.arange(draws), pairs))
-        found = {"posterior": values}
-        if self.population is not None:
+        found = {"posterior": values, "fan": self.fan.table(ids)}
+        if self.population is None:
+            found["prior"] = pd.DataFrame(self.prior.numpy(), columns=columns)
+        else:
             drawn = self.population.draw(NEW_DRIVERS, seed=seed).numpy()
             found["population"] = pd.DataFrame(drawn, columns=columns)
         return found
@@ -142,6 +149,16 @@ def parameter_intervals(
     values = space.from_unit(torch.sigmoid(found.quantiles))
     low, median, high = values.unbind(1)
     scale, correlation, left = _noise(posterior, normal)
+    whole = posterior_of(solver, batch, batch.lengths - 1, settings)
+    fan = fan_of(
+        replace(whole, stride=posterior.stride),
+        last.cpu(),
+        found.draws,
+        shares,
+        seed=solver.seed,
+        memory=solver.memory,
+    )
+    before = posterior.prior.draw(NEW_DRIVERS, len(space), seed=solver.seed)
     return ParameterIntervals(
         space.names,
         low,
@@ -154,6 +171,8 @@ def parameter_intervals(
         effective_samples=found.effective,
         pareto_k=found.pareto_k,
         draws=space.from_unit(torch.sigmoid(found.draws[..., : len(space)])),
+        prior=space.from_unit(torch.sigmoid(before)),
+        fan=fan,
         population=population,
     )
 

@@ -390,6 +390,13 @@ def _stress_lines(stress: dict[str, Any]) -> list[str]:
             f"- **{event['kind']}** ({event['number']} times in SUMO): {event['collisions']}"
             f" collisions, hardest braking {event['hardest_braking']:.1f} m/s2"
         )
+    if "town" in stress:
+        town = stress["town"]
+        lines.append(
+            f"- **In town**: saturation flow at a light {town['saturation_flow']:,.0f} vehicles an"
+            f" hour of green and lane, start-up lost time {town['lost_time']:.1f} s;"
+            f" {town['outside']:.0%} of steps in crossing traffic are outside the valid range"
+        )
     return lines
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from cfx_sumo.drive.queue import QueueAtLight
 from cfx_sumo.drive.run import Histogram
 
 pytest.importorskip("traci", reason="needs the extra sumo")
@@ -86,13 +87,16 @@ print(json.dumps(result.to_json()))
         [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=1800
     )
     assert done.returncode == 0, done.stderr
-    events = json.loads(done.stdout.splitlines()[-1])["events"]
+    found = json.loads(done.stdout.splitlines()[-1])
+    events, town = found["events"], found["town"]
     assert [event["kind"] for event in events] == [
         "cut-ins",
         "leaders braking at 9 m/s2",
         "standing vehicles",
         "a lane drop",
         "a red light",
+        "a queue at a light",
+        "crossing traffic in town",
     ]
     # Each vehicle that cuts in or brakes is the next ahead of the car, at a gap that was asked for.
     assert events[0]["number"] == 30
@@ -101,11 +105,55 @@ print(json.dumps(result.to_json()))
     assert 1.0 < events[1]["headway"][0] < events[1]["headway"][2] < 3.0
     assert events[2]["headway"] is None
     assert events[3]["number"] > 100
+    assert events[6]["number"] > 200
+    assert 1200 < town["saturation_flow"] < 2000
+    assert 2.5 < town["standing_gap"] < 4.0
+    assert 0 < town["outside"] < 1
     for event in events:
         assert event["collisions"] == 0
         assert 0.5 < event["hardest_braking"] <= 9.0 + 1e-6
         assert event["hardest_acceleration"] <= 2.6 + 1e-6
         assert event["smallest_gap"] > 0
+
+
+class Light:
+    """A light, and seven cars that cross its line 3, 5, 7.5 s and so on after it turns green."""
+
+    CROSSES = (3.0, 5.0, 7.5, 9.5, 11.5, 13.5, 15.5)
+
+    def __init__(self) -> None:
+        self.now = 200.0
+        self.simulation = self.lane = self.trafficlight = self.vehicle = self
+
+    def getTime(self) -> float:  # noqa: N802 - SUMO's names
+        return self.now
+
+    def getPhase(self, _: str) -> int:  # noqa: N802
+        return 2 if 210.0 <= self.now < 240.0 else 0
+
+    def getLastStepVehicleIDs(self, _: str) -> list[str]:  # noqa: N802
+        waiting = [f"v{k}" for k, s in enumerate(self.CROSSES) if self.now < 210.0 + s]
+        return [*waiting, "late"]
+
+    def getSpeed(self, name: str) -> float:  # noqa: N802
+        return 10.0 if name == "late" else 0.0
+
+    def getLanePosition(self, name: str) -> float:  # noqa: N802
+        return 500.0 - 7.5 * int(name[1:])
+
+    def getLength(self, _: str) -> float:  # noqa: N802
+        return 4.5
+
+
+def test_a_queue_has_its_headways_from_the_fifth_car_on() -> None:
+    light, queue = Light(), QueueAtLight()
+    for step in range(500):
+        queue.act(light, step)
+        light.now += 0.1
+    assert queue.headways == [pytest.approx([3.0, 2.0, 2.5, 2.0, 2.0, 2.0, 2.0], abs=0.11)]
+    assert queue.saturation_flow == pytest.approx(1800, rel=0.02)
+    assert queue.lost_time == pytest.approx(1.5, abs=0.3)
+    assert queue.gaps == pytest.approx([3.0] * 6)
 
 
 def test_without_a_window_gui_is_one_sentence(

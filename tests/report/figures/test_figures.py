@@ -41,6 +41,9 @@ def _drawn(results: Results) -> dict[str, float]:
     return {f"parameter_{axis.name}": 2.0 for axis in results.parameters}
 
 
+FAN = {"low": 0.5, "median": 1.0, "high": 1.5}
+
+
 @pytest.fixture(scope="module")
 def everything() -> Results:
     """Results of a job that measured all that figures can show."""
@@ -72,6 +75,8 @@ def everything() -> Results:
         "slices": slices,
         "fits": fits.assign(train_rmse_speed=0.3, test_rmse_speed=0.4, **_known(results)),
         "posterior": fits.assign(draw=0, **_drawn(results)),
+        "prior": pd.DataFrame([_drawn(results)] * 3),
+        "fan": fits.assign(time_s=1.0, calibrated_on=False, signal="speed", measured=1.0, **FAN),
         "labels": labels.assign(**{f"parameter_{axis.name}": 1.0}),
     }
     return dataclasses.replace(results, tables={**results.tables, **tables})

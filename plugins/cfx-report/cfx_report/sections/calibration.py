@@ -38,7 +38,8 @@ class CalibrationSection(Section):
 {% call fold(one.names, loop.first, "job") %}
 {{ drawn("calibration", one.job) }}
 {{ table(one.sheet, explain=loop.first) }}
-{% for name in ("identifiability", "posterior_intervals", "posterior_pairs", "fit_train_test") %}
+{% for name in ("identifiability", "posterior_intervals", "posterior_pairs", "posterior_fan",
+   "fit_train_test") %}
 {% set beyond = drawn(name, one.job) %}
 {% if beyond %}
 <p>{{ caption(name) }}</p>
