@@ -139,19 +139,22 @@ class Jobs:
         return results(target)
 
 
-def complaint(jobs: Jobs, job: str, key: str, values: list[Any]) -> str:
-    """Returns what is wrong with a setting; "" if it changes a job or is refused by name."""
+ACTS, REFUSED = "acts", "refused"
+
+
+def outcome(jobs: Jobs, job: str, key: str, values: list[Any]) -> str:
+    """Returns that a setting changes a job or is refused by name, or else what is wrong with it."""
     said = []
     more = [WITH[key]] if key in WITH else []
     for value in values:
         override = f"{key}={written(value)}"
         try:
             if jobs.run(job, *more, override) != jobs.plain(job, *more):
-                return ""
+                return ACTS
             said.append(f"{override} changes nothing")
         except CfxError as error:
             if key.rpartition(".")[2] in str(error):
-                return ""
+                return REFUSED
             said.append(f"{override}: {error}")
     return f"{key} ({job}): {'; '.join(said) or 'no other value is known'}"
 
@@ -174,13 +177,13 @@ def test_every_setting_acts_or_is_refused(
         for (_, key), (doer, value, config) in list(cases().items())[::EVERY]
         if doer == job
     ]
-    complaints = []
+    outcomes = []
     for number, (key, value, config) in enumerate(found, start=1):
         values = VALUES.get(key) or other_values(key, value, config)
-        said = complaint(jobs, job, key, values)
-        print(f"{job}, {number} of {len(found)}: {said or key}", flush=True)
-        if said:
-            complaints.append(said)
+        outcomes.append(outcome(jobs, job, key, values))
+        print(f"{job}, {number} of {len(found)}: {key}: {outcomes[-1]}", flush=True)
+    print(f"{job}: {outcomes.count(ACTS)} act, {outcomes.count(REFUSED)} are refused, of {len(found)}")
+    complaints = [said for said in outcomes if said not in {ACTS, REFUSED}]
     assert not complaints, f"{len(complaints)} of {len(found)} settings:\n" + "\n".join(complaints)
 
 
