@@ -83,6 +83,7 @@ def test_a_job_config_cannot_be_changed() -> None:
             "style.cluster=agressive",
             r"^style\.cluster='agressive': should be 'all', 'conservative'",
         ),
+        ("metrics=[1,2]", r"^metrics\.0=1: should be a valid string\.$"),
         ("metrics=[]", r"^metrics=\[\]: write all, or a list of names"),
         ("metrics=3", r"^metrics=3: write all, or a list of names"),
         (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import subprocess
 from pathlib import Path
 
 import pandas as pd
@@ -19,6 +20,7 @@ from cfx.data.tidy import frame_of, read_tidy
 from cfx.models.krauss import Krauss
 from tests.broken_plugins import QUICK
 from tests.drives import wavy_pairs
+from tests.scripts import ENVIRONMENT, command_of
 
 TRUE = torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64)
 
@@ -77,8 +79,37 @@ def test_rows_may_end_in_a_comma(tmp_path: Path, rows: str) -> None:
     assert pd.DataFrame(table.numbers)[["a", "b"]].to_numpy().tolist() == [[1, 2], [3, 4]]
 
 
-def test_more_than_a_comma_is_still_refused(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("rows", "says"),
+    [
+        ("1,2\n3,4,5\n", "row 3: 3 columns instead of 2"),
+        ("1,2,\n3,4\n", "row 3: 2 columns instead of 3"),
+        ("1,2,\n3,4,5\n", "row 3: '5' stands behind the last of 2 columns"),
+    ],
+)
+def test_more_than_a_comma_is_still_refused(tmp_path: Path, rows: str, says: str) -> None:
     path = tmp_path / "table.csv"
-    path.write_text("a,b\n1,2\n3,4,5\n")
-    with pytest.raises(DataError, match="3 columns instead of 2"):
+    path.write_text("a,b\n" + rows)
+    with pytest.raises(DataError, match=says):
         read_table(path, Layout(name="two", columns=(Column("a"), Column("b"))))
+
+
+@pytest.mark.slow
+def test_a_program_that_was_told_of_a_bad_row_ends(tmp_path: Path) -> None:
+    """One in eight did not while pyarrow read in the background."""
+    (tmp_path / "table.csv").write_text("a,b\n" + 1000 * "1,2\n" + "3,4,5\n")
+    text = f"""
+from pathlib import Path
+from cfx.core.errors import DataError
+from cfx.data.table import Column, Layout, read_table
+try:
+    read_table(Path({str(tmp_path / "table.csv")!r}), Layout(name="two", columns=(Column("a"),)))
+except DataError:
+    print("refused")
+"""
+    command = command_of(text, tmp_path)
+    for _ in range(30):
+        done = subprocess.run(
+            command, env=ENVIRONMENT, capture_output=True, text=True, check=False, timeout=60
+        )
+        assert (done.returncode, done.stdout) == (0, "refused\n")

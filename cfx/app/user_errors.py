@@ -142,7 +142,7 @@ def _options_with(group: str, setting: str, chosen: str) -> str:
                 found.append(f"{group}={name}")
     if not found:
         return ""
-    return f" {group}={chosen} has none; choose {listed(found, 5)} too."
+    return f" {group}={chosen} has none; choose {listed(found)} too."
 
 
 def _keys(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:

@@ -7,7 +7,7 @@ import hashlib
 import inspect
 import json
 from abc import ABC
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeVar, get_args
 
@@ -175,8 +175,21 @@ def validate(schema: type[Schema], values: Any, *, where: str) -> Schema:
         at: dict[tuple[str, ...], list[Any]] = {}
         for problem in error.errors():
             at.setdefault(_location(values, problem), []).append(problem)
-        sentences = [_sentence(schema, key, found, where) for key, found in at.items()]
+        sentences = [_sentence(schema, key, at[key], where) for key in _one_a_mistake(at)]
         raise ConfigError("\n".join(sentences)) from None
+
+
+def _one_a_mistake(found: Mapping[tuple[str, ...], Any]) -> Iterator[tuple[str, ...]]:
+    """Yields the keys to complain of: of a list its first wrong item, not the list as a whole."""
+    lists = set()
+    for key in found:
+        if any(other[: len(key)] == key for other in found if other != key):
+            continue
+        if key and key[-1].isdecimal():
+            if key[:-1] in lists:
+                continue
+            lists.add(key[:-1])
+        yield key
 
 
 def _location(values: Any, problem: Any) -> tuple[str, ...]:

@@ -666,11 +666,14 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
         types[f"c{one.at}"] = number_type
         if one.column.is_name:
             types[f"c{one.at}"] = pa.dictionary(pa.int32(), pa.string())
+    width = len(text.names) + spare
+    if spare:
+        types[f"c{width - 1}"] = pa.string()
     read_options = pa.csv.ReadOptions(
         # One thread: only then does pyarrow know the number of a broken row.
         use_threads=False,
         block_size=_BLOCK,
-        column_names=[f"c{at}" for at in range(len(text.names) + spare)],
+        column_names=[f"c{at}" for at in range(width)],
         skip_rows=text.skipped,
     )
     options = {
@@ -680,7 +683,8 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
     }
     try:
         with _Lines(text) as lines, pa.PythonFile(lines, mode="r") as file:
-            return pa.csv.open_csv(file, **options).read_all()
+            # Not open_csv: after an error its threads may wait for one another when Python exits.
+            table = pa.csv.read_csv(file, **options)
     except pa.ArrowInvalid as error:
         if broken:
             row = broken[0]
@@ -689,11 +693,20 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
                 return _parsed(text, found, number_type, spare=1)
             raise DataError(
                 f"{text.path}, row {row.number}: {row.actual_columns} columns instead of"
-                f" {len(text.names)}; is the file cut off there, or does a cell hold a separator?"
+                f" {width}; is the file cut off there, or does a cell hold a separator?"
             ) from None
         if number_type == pa.string():
             raise DataError(f"{text.path}: cannot be read as a table ({error})") from None
         raise
+    if spare:
+        nameless = table.column(f"c{width - 1}").to_pylist()
+        row = next((at for at, cell in enumerate(nameless) if cell and cell.strip()), None)
+        if row is not None:
+            raise DataError(
+                f"{text.path}, row {row + text.skipped + 1}: '{nameless[row]}' stands behind the"
+                f" last of {len(text.names)} columns; does a cell hold a separator?"
+            )
+    return table
 
 
 class _Lines(io.RawIOBase):

@@ -679,5 +679,10 @@ def _address(uri: str) -> tuple[str, tuple[str, ...]]:
     """Returns the address of MLflow's pages, and what to do first to have them."""
     if uri.startswith(("http://", "https://")):
         return uri.rstrip("/"), ()
-    where = "" if uri == tracking_uri(None) else f" --uri {shlex.quote(uri)}"
+    # A program may have set the environment's URI itself; a shell does not know it then. Other
+    # databases' URIs hold passwords.
+    known = uri == tracking_uri(None)
+    if uri.startswith("sqlite"):
+        known = known and "MLFLOW_TRACKING_URI" not in os.environ
+    where = "" if known else f" --uri {shlex.quote(uri)}"
     return "http://127.0.0.1:5000", (f"To see it in MLflow: python -m cfx ui{where}",)

@@ -188,7 +188,9 @@ def test_undefined_metrics_are_kept_as_such(uri: str, client: Any) -> None:
     assert np.isnan(client.get_run(run.run_id).data.metrics["rmse_improvement/p_value"])
 
 
-def test_a_store_is_made_beside_the_outputs(tmp_path: Path) -> None:
+def test_a_store_is_made_beside_the_outputs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with Tracker.open(config_of(None), tmp_path / "job") as run:
         run.set_tags({"x": "y"})
     assert (tmp_path / "outputs" / "mlflow.db").is_file()
@@ -198,6 +200,9 @@ def test_a_store_is_made_beside_the_outputs(tmp_path: Path) -> None:
     (line,) = run.how_to_open()
     assert line.startswith("To see it in MLflow: python -m cfx ui, then http://127.0.0.1:5000/#/")
     assert f"runs/{run.run_id}?" in line
+    monkeypatch.setenv("MLFLOW_TRACKING_URI", run.store.uri)  # as programs do, which a shell
+    (line,) = run.how_to_open()  # does not know of
+    assert f"python -m cfx ui --uri {run.store.uri}, then" in line
 
 
 def test_tracking_can_be_off(tmp_path: Path, saved_policy: SimpleNamespace) -> None:

@@ -182,7 +182,9 @@ def test_every_setting_acts_or_is_refused(
         values = VALUES.get(key) or other_values(key, value, config)
         outcomes.append(outcome(jobs, job, key, values))
         print(f"{job}, {number} of {len(found)}: {key}: {outcomes[-1]}", flush=True)
-    print(f"{job}: {outcomes.count(ACTS)} act, {outcomes.count(REFUSED)} are refused, of {len(found)}")
+    print(
+        f"{job}: {outcomes.count(ACTS)} act, {outcomes.count(REFUSED)} are refused, of {len(found)}"
+    )
     complaints = [said for said in outcomes if said not in {ACTS, REFUSED}]
     assert not complaints, f"{len(complaints)} of {len(found)} settings:\n" + "\n".join(complaints)
 

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import sys
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from cfx.app import nodes
@@ -51,10 +54,10 @@ def check(kind: str | None = None, name: str | None = None) -> int:
         )
     chosen = _chosen(kind, name)
     verdicts = []
-    # Of what the components say while they are tried, nothing is printed.
     with console_logging(Task.__module__), Task("Checking components", len(chosen)) as task:
         for entry in chosen:
-            verdicts.append(examine(entry))
+            with _unheard():
+                verdicts.append(examine(entry))
             task.advance()
     rows = blank_table("kind", "name", "distribution", "version", "from", "state")
     for one in verdicts:
@@ -71,6 +74,17 @@ def check(kind: str | None = None, name: str | None = None) -> int:
     if complaints:
         return 1
     return 0
+
+
+@contextlib.contextmanager
+def _unheard() -> Iterator[None]:
+    """Prints nothing of what components say while they are tried."""
+    before = logging.root.manager.disable
+    logging.disable(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def _once(texts: list[str]) -> list[str]:

@@ -96,7 +96,7 @@ class FollowernetDataset(Dataset):
             parts.append(pairs_of(series, str(path)))
         pairs = joined(parts)
         problem = "events carry no drivers' ids: one driver may be learned from and tested"
-        return Contents(pairs, rows, 2 * len(pairs), problem)
+        return Contents(pairs, rows, 2 * len(pairs), problem, has_gaps=True)
 
     def _series(self, path: Path, number: int, event: Floats) -> Series:
         recording = stem(path)

@@ -92,7 +92,8 @@ class OpenaccDataset(Dataset):
         files = [_read(path) for path in self.settings.files()]
         vehicles = sum(len(file.speeds) for file in files)
         rows = sum(len(file.frame) for file in files)
-        return Contents(joined([_pairs(file) for file in files]), rows, vehicles)
+        pairs = joined([_pairs(file) for file in files])
+        return Contents(pairs, rows, vehicles, has_gaps=True)
 
 
 class _File(NamedTuple):

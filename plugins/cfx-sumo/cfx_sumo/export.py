@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
@@ -93,11 +94,12 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     further = ""
     if drawn is not None:
         further = f"; {len(drawn)} drawn from their population in '{POPULATION}'"
+    file = shlex.quote(str(path.absolute()))
     return [
         f"vTypes of SUMO's {kind.car_follow_model}, in one vTypeDistribution for each cluster:"
         f" {', '.join(counts)}; all together in '{ALL_DRIVERS}'{further}",
         *[f"Note: {note}" for note in notes],
-        f"Use it: sumo --step-length {step:g} --additional-files {path.absolute()}; then in a flow"
+        f"Use it: sumo --step-length {step:g} --additional-files {file}; then in a flow"
         f' or vehicle: type="{ALL_DRIVERS}", or type={first}',
     ]
 

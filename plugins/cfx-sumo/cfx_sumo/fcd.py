@@ -5,6 +5,7 @@ https://sumo.dlr.de/docs/Simulation/Output/FCDOutput.html
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from typing import Annotated, ClassVar, NamedTuple
 
@@ -12,12 +13,17 @@ import numpy as np
 from pydantic import Field
 
 from cfx import Dataset, PairSet, Settings
-from cfx.core.errors import DataError
+from cfx.core.errors import DataError, listed
 from cfx.data.base import FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
 from cfx.data.tracks import NOBODY, Marks, Tracks, counted, extract_pairs
 from cfx_sumo.fcd_lanes import Couples, Lanes
 from cfx_sumo.fcd_rows import FcdRows, is_fcd, read_rows
+
+log = logging.getLogger(__name__)
+
+_LENGTH_IS_SUMOS = frozenset({"DEFAULT_VEHTYPE"})
+"""vTypes that nobody declared: 5 m long, as SUMO says."""
 
 
 class SumoFcdSettings(FileDatasetSettings):
@@ -124,7 +130,9 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
     length = np.array([lengths_of.get(name, settings.length) for name in types])[kind]
     position, number_of_lane = lanes.position, lanes.lane
     gap: Floats | None = None
-    if not bool(np.isnan(rows.numbers["leaderGap"]).all()):
+    if bool(np.isnan(rows.numbers["leaderGap"]).all()):
+        _warn_of_lengths(rows, types, settings)
+    else:
         known = {name: number + 1 for number, name in enumerate(names.tolist())}
         named = [known.get(name, NOBODY) for name in rows.texts["leaderID"][order].tolist()]
         by_name = _Ahead(np.array(named), numbers["leaderGap"][kept], length)
@@ -163,6 +171,22 @@ def _types(rows: FcdRows) -> tuple[tuple[str, ...], Ints]:
         own.append(kind.removesuffix(f"@{name}"))
     types, kind = np.unique(np.array(own), return_inverse=True)
     return tuple(types.tolist()), kind
+
+
+def _warn_of_lengths(rows: FcdRows, types: tuple[str, ...], settings: SumoFcdSettings) -> None:
+    """Warns of vTypes whose length is nothing but the default: their gaps may be wrong."""
+    known = _LENGTH_IS_SUMOS | set(settings.lengths or {})
+    guessed = [name for name in types if name not in known]
+    if guessed:
+        log.warning(
+            "%s does not say how long vehicles are: %s count as %g m, and gaps behind them are"
+            " wrong by what they differ; give 'data.lengths={%s: METRES}', or let SUMO write"
+            " leaders (--fcd-output.max-leader-distance 200)",
+            rows.path,
+            listed(guessed, 5),
+            settings.length,
+            guessed[-1],
+        )
 
 
 def _without(couples: Couples, left_out: Marks) -> Couples:

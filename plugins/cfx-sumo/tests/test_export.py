@@ -336,10 +336,9 @@ def test_what_cannot_be_exported_is_one_sentence(
 
 def test_the_command_says_how_to_use_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = job(tmp_path / "job", {"name": "w99"})
+    path = tmp_path / "my [x].add.xml"
+    assert main(["export", str(folder), "--to", "sumo", "--output", str(path)]) == 0
     assert (
-        main(["export", str(folder), "--to", "sumo", "--output", str(tmp_path / "x.add.xml")]) == 0
-    )
-    assert (
-        f"sumo --step-length 0.1 --additional-files {tmp_path / 'x.add.xml'}; then in a flow or vehicle:"
+        f"sumo --step-length 0.1 --additional-files '{path}'; then in a flow or vehicle:"
         ' type="drivers", or type="conservative"' in capsys.readouterr().out
     )

@@ -123,13 +123,18 @@ def test_reads_what_sumo_writes(of_sumo: Path) -> None:
         np.testing.assert_allclose(moved, pair.follower_speed[1:] * pair.dt, atol=1e-5)
 
 
-def test_leaders_are_those_that_sumo_names(of_sumo: Path, tmp_path: Path) -> None:
+def test_leaders_are_those_that_sumo_names(
+    of_sumo: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     text = of_sumo.read_text()
     plain = tmp_path / "plain.xml"
     plain.write_text(text.replace("leaderGap=", "other=").replace("leaderID=", "another="))
     options = {"min_frames": 50, "lengths": {"car": 4.3, "truck": 12.0}}
     by_name = SumoFcdDataset(path=of_sumo, **options).load()
     by_place = SumoFcdDataset(path=plain, **options).load()
+    assert not caplog.messages
+    SumoFcdDataset(path=plain, min_frames=50, lengths={"car": 4.3}).read()
+    assert "how long vehicles are: truck count as 5 m" in caplog.text
     gaps = {(p.follower_id, p.leader_id, p.first_frame): p.gap for p in by_place}
     matched = 0
     for pair in by_name:
