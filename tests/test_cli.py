@@ -142,6 +142,10 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
             ["modl.parameters.v0.low=3"],
             "'modl.parameters.v0.low'. Did you mean 'model.parameters.v0.low'?",
         ),
+        (
+            ["data=tidy", "data.path=x.csv", "data.columns={pairid: trip}"],
+            "'data.columns.pairid'. Did you mean 'data.columns.pair_id'? Known keys of",
+        ),
         (["modle=w99", "policy=nope"], "policy=nope: there is no policy 'nope'."),
         (["seed=-1"], "seed=-1: should be greater than or equal to 0."),
         (["+sede=1"], "sede: unknown key. Did you mean 'seed'?"),

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, TypeGuard
 
 import yaml
+from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
@@ -110,6 +111,9 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
         config: Any = hydra_source.composed(others)
     except Exception:  # the other overrides may be wrong too; the sentence is then without advice
         return f"{given}: there is no key '{key}'; cfx --cfg job prints every key"
+    inner = _unknown_name(given, OmegaConf.select(config, key))
+    if inner:
+        return _unknown_key(f"{key}.{inner}", others)
     parent, _, last = key.rpartition(".")
     siblings = config
     if parent:
@@ -128,6 +132,15 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     everything: Any = OmegaConf.to_container(config, resolve=False)
     paths = _keys(everything)
     return f"{given}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
+
+
+def _unknown_name(override: str, node: object) -> str:
+    """Returns the first name in an override's mapping that a node does not have; "" without one."""
+    if not isinstance(node, DictConfig):
+        return ""
+    value = OverridesParser.create().parse_override(override).value()
+    names = value if isinstance(value, dict) else ()
+    return next((str(name) for name in names if str(name) not in node), "")
 
 
 def _options_with(group: str, setting: str, chosen: str) -> str:
