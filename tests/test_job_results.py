@@ -11,13 +11,13 @@ import pandas as pd
 import pytest
 from rich.console import Console
 
-from cfx.app.job.console import report
+from cfx.app.job.console import report, report_places
 from cfx.app.job.output import write_tables
 from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
-from cfx.results.table import Findings, Kept
+from cfx.results.table import Findings
 from tests.made_up import GAINS, make_history, make_platoon, make_results, with_metric
 
 
@@ -29,8 +29,9 @@ class Untracked:
 def said(evaluation: Evaluation, *, width: int = 200) -> str:
     """Returns what a job prints."""
     out = io.StringIO()
-    kept = Kept(Path("folder"), evaluation.metrics(), (), (), ())
-    report(findings(evaluation), kept, Console(file=out, width=width), cast(Any, Untracked()))
+    console = Console(file=out, width=width)
+    report(findings(evaluation), evaluation.metrics(), (), console)
+    report_places(Path("folder"), console, cast(Any, Untracked()))
     return out.getvalue()
 
 

@@ -183,10 +183,12 @@ class Fit:
         return pd.DataFrame(errors)
 
     def __repr__(self) -> str:
+        from cfx.figures.text import short_label
+
         part = "test" if self._context.split < 1 else "train"
         found = self.losses.groupby("method")[f"{part}_rmse_speed"].mean()
         where = "the test part" if part == "test" else "what was calibrated on"
-        means = [f"{method} {found[method]:.3f}" for method in METHODS]
+        means = [f"{short_label(method)} {found[method]:.3f}" for method in METHODS]
         return (
             f"Fit({self.model}, {len(self.parameters)} pairs; RMSE of speed on {where}, m/s:"
             f" {', '.join(means)})"

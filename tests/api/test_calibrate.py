@@ -89,7 +89,7 @@ def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
     assert table["pooled"].tolist() == fit.pooled.tolist()
     assert table["at_bound"].between(0, 1).all()
     assert "parameter" in fit._repr_html_()
-    assert "fixed" in repr(fit)
+    assert "driver-specific" in repr(fit)
 
 
 def test_figures_show_themselves_in_notebooks(fit: cfx.Fit, pairs: cfx.Pairs) -> None:

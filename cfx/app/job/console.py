@@ -1,10 +1,10 @@
-"""What a job prints when it is done, and the lines that MLflow shows as its description."""
+"""What a job prints when it has measured, and the lines that MLflow shows as its description."""
 
 from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -23,7 +23,7 @@ from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import scope_label
 from cfx.figures.text import few_drivers, short_label
 from cfx.results.config import JobConfig
-from cfx.results.table import Findings, Kept
+from cfx.results.table import Findings, WrittenTable
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
@@ -32,39 +32,37 @@ if TYPE_CHECKING:
 
 def report(
     findings: Findings,
-    kept: Kept,
+    metrics: Mapping[str, float],
+    tables: Sequence[WrittenTable],
     console: Console,
-    tracker: Tracker,
-    copied_to: str | None = None,
 ) -> None:
-    """Prints the table, where the results are and how to open them.
+    """Prints what was measured.
 
     Args:
         findings: what was measured.
-        kept: what the job has written.
+        metrics: of the job.
+        tables: those that it has.
         console: where it is printed.
-        tracker: says how to open the job's run.
-        copied_to: URL of the folder's copy; None without.
     """
     evaluation = findings.evaluation
-    console.print(methods_table(evaluation, kept.metrics))
+    console.print(methods_table(evaluation, metrics))
     if "full_trajectory" in evaluation.improvements:
-        console.print(methods_table(evaluation, kept.metrics, "full_trajectory"))
+        console.print(methods_table(evaluation, metrics, "full_trajectory"))
     if evaluation.purpose is Purpose.CALIBRATION:
-        _print_headline(kept.metrics, console)
+        _print_headline(metrics, console)
     elif evaluation.purpose is Purpose.ADAPTATION:
         _print_improvements(evaluation, console)
-        _print_headline(kept.metrics, console)
+        _print_headline(metrics, console)
     else:
         text = (
             "With constant parameters the model follows no leader: compare the policy's RMSE"
             " with other jobs'."
         )
         console.print(text, soft_wrap=True)
-    for table in kept.tables:
-        for printed in table.console(findings, kept.metrics):
+    for table in tables:
+        for printed in table.console(findings, metrics):
             console.print(printed)
-    _print_safety(evaluation, kept.metrics, console)
+    _print_safety(evaluation, metrics, console)
     _print_flat(evaluation, console)
     for scope, words in evaluation.outside.items():
         text = f"Policy, {scope_label(scope)}: {words}; there it fades towards its base parameters."
@@ -72,10 +70,23 @@ def report(
     for one in evaluation.left_out:
         text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
         console.print(text, soft_wrap=True, highlight=False)
-    console.print(f"Results: {kept.folder}", soft_wrap=True, highlight=False, markup=False)
+
+
+def report_places(
+    folder: Path, console: Console, tracker: Tracker, copied_to: str | None = None
+) -> None:
+    """Prints where the results are and how to open them.
+
+    Args:
+        folder: of the job.
+        console: where it is printed.
+        tracker: says how to open the job's run.
+        copied_to: URL of the folder's copy; None without.
+    """
+    console.print(f"Results: {folder}", soft_wrap=True, highlight=False, markup=False)
     if copied_to is not None:
         console.print(f"Copied to: {copied_to}", soft_wrap=True, highlight=False, markup=False)
-    for page in sorted(kept.folder.glob(f"*/{PAGE}")):
+    for page in sorted(folder.glob(f"*/{PAGE}")):
         console.print(
             f"Demonstration, for any browser: {page}", soft_wrap=True, highlight=False, markup=False
         )

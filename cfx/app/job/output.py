@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
@@ -57,8 +57,21 @@ def begin(folder: Path, config: JobConfig) -> None:
             _write_config(folder, config)
 
 
-def write_job(folder: Path, config: JobConfig, parts: Parts, findings: Findings) -> Kept:
+Told = Callable[[Mapping[str, float], Sequence[WrittenTable]], None]
+"""Is told a job's metrics and tables."""
+
+
+def write_job(
+    folder: Path, config: JobConfig, parts: Parts, findings: Findings, tell: Told | None = None
+) -> Kept:
     """Writes all that a job leaves behind.
+
+    Args:
+        folder: of the job.
+        config: of the job.
+        parts: its components.
+        findings: what was measured.
+        tell: is told the results before figures are drawn, which takes seconds.
 
     Raises:
         CfxError: a demonstration cannot be shown, or a file cannot be written.
@@ -69,6 +82,8 @@ def write_job(folder: Path, config: JobConfig, parts: Parts, findings: Findings)
         _write_config(folder, config)
         tables = write_tables(folder, findings)
         metrics = measured(findings, tables)
+        if tell is not None:
+            tell(metrics, tables)
         checkpoint.save(result.policy, folder / "policy")
         figures: list[Path] = []
         if config.figures.enabled:

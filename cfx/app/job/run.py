@@ -40,12 +40,13 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     from rich.console import Console
 
     from cfx.app.job import output, steps
-    from cfx.app.job.console import described, report
+    from cfx.app.job.console import described, report, report_places
     from cfx.app.job.output import Upload
     from cfx.app.job.results import Computed, JobResult
     from cfx.results.tracker import Tracker
 
     data = config.data
+    console = console or Console()
     config, parts = steps.prepare(config)
     output.begin(folder, config)
     upload = Upload.of(config.output.url, folder)
@@ -58,14 +59,21 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         tracker.set_tags(steps.tags_of(pairs))
         context = steps.compose(config, parts, pairs, style)
         findings = steps.find(context, parts, config.calibration)
-        kept = output.write_job(folder, config, parts, findings)
+        # Figures take seconds: the numbers are there before them.
+        kept = output.write_job(
+            folder,
+            config,
+            parts,
+            findings,
+            tell=lambda metrics, tables: report(findings, metrics, tables, console),
+        )
         # After the folder, so that no failure of MLflow loses it.
         tracker.log_job(findings, kept, described(config, findings, kept.metrics))
         if upload is not None:
             upload.finish()
             tracker.set_tags({"cfx.output_url": upload.url})
     copied_to = None if upload is None else upload.url
-    report(findings, kept, console or Console(), tracker, copied_to)
+    report_places(kept.folder, console, tracker, copied_to)
     return JobResult(
         metrics=kept.metrics,
         pairs=findings.evaluation.table,
