@@ -9,7 +9,7 @@ density over that of the whole mixture (AMIS). While a few samples have nearly a
 are raised to a power below 1, so that the mixture comes to the posterior step by step. The largest
 weights are smoothed by a Pareto distribution (PSIS, of ArviZ). Its shape k says whether weighted
 samples stand in for the posterior: they do below 0.7. Drivers for whom they do leave the search,
-others go on.
+others go on; those who do not settle in the end get tempered samples instead (`tempered`).
 
 J.-M. Cornuet, J.-M. Marin, A. Mira and C. P. Robert (2012), *Adaptive multiple importance
 sampling*, Scandinavian Journal of Statistics 39(4). A. Vehtari, D. Simpson, A. Gelman, Y. Yao and
@@ -32,6 +32,7 @@ from torch import Tensor
 from cfx.calibration.posterior.density import Posterior
 from cfx.calibration.posterior.laplace import Normal, curvature
 from cfx.calibration.posterior.levels import RELIABLE
+from cfx.calibration.posterior.tempered import tempered
 
 SAMPLES = 100
 """Samples of a component at a single sample."""
@@ -72,8 +73,8 @@ class Sampled(NamedTuple):
     Attributes:
         quantiles: of each parameter's logit, `(P, shares, n)`.
         draws: equally weighted draws of all coordinates, `(P, DRAWS, d)`.
-        effective: effective sample size that quantiles rest on, `(P,)`.
-        pareto_k: of the weights, `(P,)`; above 0.7 nothing here is reliable.
+        effective: effective sample size of the weighted samples, `(P,)`.
+        pareto_k: of the weights, `(P,)`; above 0.7 quantiles and draws are of tempered samples.
     """
 
     quantiles: Tensor
@@ -181,7 +182,25 @@ def _sampled(posterior: Posterior, normal: Normal, shares: Tensor, seed: int) ->
         found.append((drivers, Sampled(quantiles, draws, _effective(smoothed), k)))
     order = torch.cat([drivers for drivers, _ in found]).argsort()
     together = zip(*(part for _, part in found), strict=True)
-    return Sampled(*(torch.cat(values)[order] for values in together))
+    return _mended(
+        posterior, Sampled(*(torch.cat(values)[order] for values in together)), seed, shares
+    )
+
+
+def _mended(posterior: Posterior, found: Sampled, seed: int, shares: Tensor) -> Sampled:
+    """Returns tempered samples of the drivers whose weighted ones do not settle."""
+    doubtful = (~found.reliable).nonzero()[:, 0]
+    if len(doubtful) == 0:
+        return found
+    places = tempered(posterior.take(doubtful), seed)
+    generator = torch.Generator().manual_seed(seed)
+    kept = torch.randperm(places.shape[1], generator=generator)[:DRAWS]
+    n = len(posterior.space)
+    quantiles = places[..., :n].quantile(shares, dim=1).transpose(0, 1)
+    return found._replace(
+        quantiles=found.quantiles.index_copy(0, doubtful, quantiles),
+        draws=found.draws.index_copy(0, doubtful, places[:, kept]),
+    )
 
 
 def _finished(

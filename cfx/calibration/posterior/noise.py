@@ -79,10 +79,31 @@ def filtered(values: Tensor, phi: Tensor) -> Tensor:
     return found
 
 
+def prior_log_density(noise: Tensor) -> Tensor:
+    """Returns the log density of the noise's parameters `(*batch, m + 1)` a priori, `(*batch,)`.
+
+    It leaves constants out. Partial autocorrelations are uniform.
+    """
+    squashed, log_scale = noise[..., :-1], noise[..., -1]
+    # log(1 - tanh(x)^2) without cancellation.
+    size = squashed.abs()
+    uniform = 2.0 * (math.log(2.0) - size - softplus(-2.0 * size)).sum(-1)
+    found: Tensor = uniform - 2.0 * SHAPE * log_scale - RATE * torch.exp(-2.0 * log_scale)
+    return found
+
+
+def draw(count: int, order: int, generator: torch.Generator) -> Tensor:
+    """Returns parameters of noise as they are a priori, `(count, m + 1)`."""
+    uniform = torch.rand((count, order + 1), generator=generator, dtype=torch.float64)
+    uniform = uniform.clamp(1e-12, 1.0 - 1e-12)
+    gamma = -torch.log(uniform[:, -1:])  # of shape 1, which is `SHAPE`
+    return torch.cat([torch.atanh(2.0 * uniform[:, :-1] - 1.0), 0.5 * (RATE / gamma).log()], dim=-1)
+
+
 def log_density(products: Tensor, count: Tensor, noise: Tensor) -> Tensor:
     """Returns the log density of errors and of the noise's parameters, `(*batch,)`.
 
-    It leaves constants out. Partial autocorrelations are uniform a priori.
+    It leaves constants out.
 
     Args:
         products: of `lagged_products`, `(*batch, m + 1, m + 1)`.
@@ -95,11 +116,7 @@ def log_density(products: Tensor, count: Tensor, noise: Tensor) -> Tensor:
     squares = (whole[..., :, None] * products * whole[..., None, :]).sum((-2, -1))
     precision = torch.exp(-2.0 * log_scale)
     likelihood = -count * log_scale - 0.5 * squares * precision
-    # log(1 - tanh(x)^2) without cancellation.
-    size = squashed.abs()
-    uniform = 2.0 * (math.log(2.0) - size - softplus(-2.0 * size)).sum(-1)
-    of_scale = -2.0 * SHAPE * log_scale - RATE * precision
-    total = likelihood + uniform + of_scale
+    total = likelihood + prior_log_density(noise)
     return torch.where(total.isfinite(), total, _LEAST_DENSITY)
 
 
