@@ -43,6 +43,9 @@ _WINDOW_S = 5.0
 _WINDOWS = 200
 """Windows of a pair that are looked at, at least, where it has as many; they overlap."""
 
+_TELLING_FRAMES = 12
+"""In fewer frames it matters whether a rate is that of the step before, behind or around."""
+
 _SHOWN = 3
 """Pairs that a message names."""
 
@@ -175,6 +178,8 @@ def agreement(values: Floats, rates: Floats, dt: float, *, whole: bool = False) 
         dt: time step, s.
         whole: the course since the first frame is compared, not changes over windows.
     """
+    if len(values) < _TELLING_FRAMES:
+        return Agreement(math.nan, 0.0, 0.0, 0.0, 0.0)
     x = np.zeros(len(rates))
     np.cumsum(rates[1:] + rates[:-1], out=x[1:])
     y, x = values, x * (0.5 * dt)

@@ -40,6 +40,9 @@ _LIKENESS_FRAMES = 8
 _ALIKE = 0.1 + 1e-9
 """m/s and m; the same trajectory saved with one decimal differs by less, two drivers by more."""
 
+_LIVELY_MPS, _TELLING_FRAMES = 1.0, 40
+"""m/s, frames: drivers may be alike whose speeds differ by less, or of whom less is known."""
+
 _TOGETHER = 1024
 """Pairs that one part of the work reads before their signals are let go of."""
 
@@ -170,6 +173,33 @@ class LearnedFrom:
             return False
         differences = np.abs(known - np.array([float(value) for value in numbers]))
         return bool((differences <= _ALIKE).all(1).any())
+
+
+def twins(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
+    """Returns the ids of pairs that drive alike as `LearnedFrom` says, each with an earlier one.
+
+    Pairs whose speed hardly changes, and short ones, are none: many may drive so.
+    """
+    by_length: dict[str, list[tuple[int, list[str]]]] = {}
+    for at, pair in enumerate(pairs):
+        frames, step, *numbers = pair.likeness.split()
+        speeds = [float(value) for value in numbers[_LIKENESS_FRAMES : 2 * _LIKENESS_FRAMES]]
+        if len(pair) >= _TELLING_FRAMES and np.ptp(speeds) > _LIVELY_MPS:
+            by_length.setdefault(f"{frames} {step}", []).append((at, numbers))
+    found = []
+    for same in by_length.values():
+        values = np.array([numbers for _, numbers in same], dtype=np.float64)
+        order = np.argsort(values.sum(1))
+        values, total = values[order], values.sum(1)[order]
+        for further in range(1, len(same)):
+            near = total[further:] - total[:-further] <= _ALIKE * values.shape[1]
+            if not near.any():
+                break
+            (first,) = np.nonzero(near)
+            alike = np.abs(values[first] - values[first + further]).max(1) <= _ALIKE
+            for one in first[alike].tolist():
+                found.append(sorted(same[order[k]][0] for k in (one, one + further)))
+    return [(pairs[one].pair_id, pairs[other].pair_id) for one, other in sorted(found)]
 
 
 @dataclass(frozen=True)

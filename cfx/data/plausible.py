@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfx.data.files import Floats
-from cfx.data.pairs import Pair, PairSet
+from cfx.data.pairs import Pair, PairSet, twins
 from cfx.data.style import STANDING_MPS
 
 Marks = NDArray[np.bool_]
@@ -58,6 +58,14 @@ def doubts(pairs: PairSet) -> Iterator[str]:
         yield (
             f"{beyond} of {len(pairs)} pairs are typically more than {_FAR_M:g} m apart ('{worst}':"
             f" {max(far):,.0f} m): is the leader the vehicle ahead, are positions in one unit?"
+        )
+    alike = twins(pairs)
+    if alike:
+        one, other = alike[0]
+        yield (
+            f"{len({copy for _, copy in alike})} of {len(pairs)} pairs drive as another one does,"
+            f" to 0.1 m and m/s ('{other}' as '{one}'): leave copies out, or who is learned from"
+            " is tested too"
         )
     for what, wrong in _DOUBTFUL.items():
         yield from _counted(pairs, what, wrong)

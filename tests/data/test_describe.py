@@ -58,6 +58,23 @@ def test_points_at_what_looks_wrong(tmp_path: Path) -> None:
     assert "position moves 1 m more or less" in describe(tmp_path / "s.csv")
 
 
+def test_names_pairs_that_are_copies_of_others(tmp_path: Path) -> None:
+    pairs = SyntheticDataset(pairs=4, frames=300).load()
+    copy = replace(
+        pairs[2],
+        pair_id="copy",
+        recording="elsewhere",
+        follower_speed=pairs[2].follower_speed.round(1),
+        leader_position=pairs[2].leader_position + 100.0,
+        follower_position=pairs[2].follower_position + 100.0,
+    )
+    standing = straight_pairs([300, 300]).pairs
+    write_tidy(PairSet((*pairs, copy, *standing), "s"), tmp_path / "s.csv")
+    said = describe(tmp_path / "s.csv")
+    assert "1 of 7 pairs drive as another one does" in said
+    assert f"('copy' as '{pairs[2].pair_id}')" in said
+
+
 def test_a_file_that_cannot_be_used_says_why(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         describe(tmp_path / "none.csv")

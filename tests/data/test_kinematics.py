@@ -27,7 +27,7 @@ from cfx.data.tracks import driven
 from cfx.models.krauss import Krauss
 from cfx_recordings.ngsim import NgsimDataset
 from tests.conftest import ROOT
-from tests.drives import wavy_pairs
+from tests.drives import straight_pairs, wavy_pairs
 
 TRUE = torch.tensor([[1.0, 0.1], [2.0, 0.4], [3.0, 0.8], [1.5, 0.2]], dtype=torch.float64)
 PAIRS = wavy_pairs(Krauss(), TRUE, frames=300)
@@ -102,6 +102,15 @@ def test_one_wrong_column_of_one_pair_is_found_and_no_other_pair(
     found = dict(contradictions(PairSet(tuple(wrong), "made up")))
     assert list(found) == [wrong[number].pair_id]
     assert signal in found[wrong[number].pair_id].signals
+
+
+def test_a_few_coarse_frames_say_nothing() -> None:
+    """Accelerations of the step before, as SUMO has them, are others than those around a frame."""
+    (coarse,) = straight_pairs([3]).pairs
+    speed = np.array([21.02, 19.29, 19.41])
+    signals = {"leader_speed": speed, "leader_acceleration": np.array([0.28, -1.73, 0.12])}
+    position = 40.0 + np.cumsum(speed)
+    assert contradiction(replace(coarse, dt=1.0, leader_position=position, **signals)) is None
 
 
 def test_a_stationary_pair_says_nothing_and_is_let_through() -> None:
