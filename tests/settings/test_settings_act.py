@@ -48,6 +48,8 @@ EXCEPTIONS = {
     "learner.start": "another job's folder",
     "learner.patience": "ends trainings that get worse; tests of both learners try it",
     "idm:learner.temperature*": "its regimes do not switch; tests of the rollout learner try it",
+    "krauss:learner.temperature*": "as idm",
+    "direct:learner.temperature*": "as idm",
     "w99:model.parameters.b.default": "SUMO's decel: exports write it, and it acts above b_max",
     "style.cluster": "each choice of drivers is another job: tests of style try each",
 }
