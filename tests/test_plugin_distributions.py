@@ -80,6 +80,7 @@ PROTOCOLS = {
 POLICIES = {
     "cfx.calibration.losses",
     "cfx.calibration.prior",
+    "cfx.core.parameters",
     "cfx.policies.checkpoint",
     "cfx.policies.context",
     "cfx.policies.ready",

@@ -15,6 +15,7 @@ import pandas as pd
 
 from cfx.api.experiment import Experiment, config
 from cfx.api.pairs import Pairs, PairsLike
+from cfx.core.errors import ConfigError
 from cfx.core.guest import visit
 
 if TYPE_CHECKING:
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from cfx.app.job.steps import Parts
+    from cfx.calibration.posterior.intervals import ParameterIntervals
     from cfx.evaluation.protocols.base import ProtocolContext
 
 METHODS = ("default", "population", "fixed")
@@ -114,6 +116,68 @@ class Fit:
         table["at_bound"] = at_bound
         return table.rename_axis("parameter")
 
+    @cached_property
+    def intervals(self) -> pd.DataFrame:
+        """What each recording says of its driver's parameters: 90 % intervals, a row per pair.
+
+        Columns are those of `fits.parquet`: `low_NAME`, `median_NAME`, `high_NAME` (SI units),
+        `contraction_NAME` (0: the recording says nothing, 1: all) and the noise's; `pareto_k` above
+        0.7 says that a row is not to be relied on.
+
+        Raises:
+            ConfigError: no posterior was asked for.
+        """
+        return pd.DataFrame(self._posterior.columns(), self.parameters.index)
+
+    @cached_property
+    def draws(self) -> pd.DataFrame:
+        """Equally likely parameters of each driver, SI units: a row per pair_id and draw.
+
+        Raises:
+            ConfigError: no posterior was asked for.
+        """
+        found = self._posterior.draws
+        rows = pd.MultiIndex.from_product(
+            [self.parameters.index, range(found.shape[1])], names=["pair_id", "draw"]
+        )
+        return pd.DataFrame(found.flatten(0, 1).numpy(), rows, self.parameters.columns)
+
+    def draw(self, drivers: int, *, seed: int = 0) -> pd.DataFrame:
+        """Draws new drivers from the population of these: parameters as correlated as theirs.
+
+        Args:
+            drivers: how many.
+            seed: the same seed gives the same drivers.
+
+        Returns:
+            A row per driver, SI units, as `cfx.simulate` takes them.
+
+        Raises:
+            ConfigError: no population was asked for (`calibration.posterior=hierarchical`).
+        """
+        population = self._posterior.population
+        if population is None:
+            raise ConfigError(f"there is no population to draw from; {_ask_for('hierarchical')}")
+        names = [f"driver {number}" for number in range(drivers)]
+        rows = population.draw(drivers, seed=seed).numpy()
+        return pd.DataFrame(rows, names, self.parameters.columns)
+
+    @cached_property
+    def _posterior(self) -> ParameterIntervals:
+        from cfx.calibration.posterior.intervals import parameter_intervals
+
+        settings, context = self.experiment.config.calibration, self._context
+        if settings.posterior == "none":
+            raise ConfigError(f"there is no posterior; {_ask_for('laplace')}")
+        with visit():
+            return parameter_intervals(
+                context.calibrator.solver,
+                context.batch,
+                self._last,
+                self._tensor("fixed"),
+                settings,
+            )
+
     def plot(self) -> Figure:
         """Draws the parameters between their bounds, and how they go together."""
         from cfx.figures.calibration import (
@@ -200,6 +264,11 @@ class Fit:
         return as_html(repr(self), self.summary())
 
 
+def _ask_for(posterior: str) -> str:
+    """Returns how a calibration asks for a posterior."""
+    return f"say cfx.calibrate(..., **{{'calibration.posterior': '{posterior}'}})"
+
+
 def calibrate(
     pairs: PairsLike,
     model: str = "idm",
@@ -220,7 +289,8 @@ def calibrate(
         objective: what is minimised, as after `objective=`: `speed_rmse`, `gap_rmse`, ...
         seed: the same seed gives the same parameters.
         settings: others of the command line: `optimizer="botorch"`, `split=0.7`,
-            `**{"model.parameters.T.high": 4.0}`.
+            `**{"model.parameters.T.high": 4.0}`. With `**{"calibration.posterior": "laplace"}`
+            the fit has `intervals` and `draws`, with `"hierarchical"` new drivers too (`draw`).
 
     Raises:
         CfxError: the pairs or a setting are wrong, in one sentence.

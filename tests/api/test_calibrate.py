@@ -92,6 +92,33 @@ def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
     assert "driver-specific" in repr(fit)
 
 
+def test_a_posterior_is_that_of_the_command_and_gives_new_drivers(
+    pairs: cfx.Pairs, tmp_path: Path
+) -> None:
+    fit = cfx.calibrate(pairs, "krauss", **RANDOM, **{"calibration.posterior": "hierarchical"})
+    off = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+    folder = tmp_path / "job"
+    cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
+    fits = pd.read_parquet(folder / "fits.parquet")
+    its = fits[fits["method"] == "fixed"].set_index("pair_id")
+    pd.testing.assert_frame_equal(fit.intervals, its[fit.intervals.columns], check_names=False)
+    its = pd.read_parquet(folder / "posterior.parquet")
+    # A job takes the point estimates, where searches start, out of its table of means over frames.
+    np.testing.assert_allclose(fit.draws["t_r"], its["parameter_t_r"], rtol=1e-6)
+    its = pd.read_parquet(folder / "population.parquet")
+    np.testing.assert_allclose(fit.draw(1000)["t_r"], its["parameter_t_r"], rtol=1e-6)
+    new = fit.draw(4, seed=1)
+    drive = cfx.simulate("krauss", new, leader=LEADER, gap=30.0, speed=14.0)
+    assert list(drive["pair_id"].unique()) == list(new.index)
+
+
+def test_without_a_posterior_there_are_no_intervals(fit: cfx.Fit) -> None:
+    with pytest.raises(ConfigError, match=r"there is no posterior; say cfx\.calibrate"):
+        _ = fit.intervals
+    with pytest.raises(ConfigError, match="there is no posterior"):
+        fit.draw(3)
+
+
 def test_figures_show_themselves_in_notebooks(fit: cfx.Fit, pairs: cfx.Pairs) -> None:
     for figure in (fit.plot(), pairs.plot()):
         assert vars(figure)["_repr_png_"]().startswith(b"\x89PNG")
