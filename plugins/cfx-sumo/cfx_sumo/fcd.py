@@ -179,8 +179,8 @@ def _warn_of_lengths(rows: FcdRows, types: tuple[str, ...], settings: SumoFcdSet
     guessed = [name for name in types if name not in known]
     if guessed:
         log.warning(
-            "%s does not say how long vehicles are: %s count as %g m, and gaps behind them are"
-            " wrong by what they differ; give 'data.lengths={%s: METRES}', or let SUMO write"
+            "%s does not say how long vehicles are: those of type %s count as %g m, and gaps behind"
+            " them are off by the difference; give 'data.lengths={%s: METRES}', or let SUMO write"
             " leaders (--fcd-output.max-leader-distance 200)",
             rows.path,
             listed(guessed, 5),

@@ -134,7 +134,7 @@ def test_leaders_are_those_that_sumo_names(
     by_place = SumoFcdDataset(path=plain, **options).load()
     assert not caplog.messages
     SumoFcdDataset(path=plain, min_frames=50, lengths={"car": 4.3}).read()
-    assert "how long vehicles are: truck count as 5 m" in caplog.text
+    assert "how long vehicles are: those of type truck count as 5 m" in caplog.text
     gaps = {(p.follower_id, p.leader_id, p.first_frame): p.gap for p in by_place}
     matched = 0
     for pair in by_name:
