@@ -66,7 +66,7 @@ def calibration_tables(
             driver-specific parameters were calibrated on, and on the test part, if there is one
             (`split`). With a posterior
             the rows of `fixed` have its columns (`ParameterIntervals.columns`) for that part too.
-        posterior, population: with a posterior, see `ParameterIntervals.tables`.
+        posterior, fan, and prior or population: with a posterior, see `ParameterIntervals.tables`.
     """
     calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
     if not calibrated or not isinstance(context.simulator, MemoryStepper):
@@ -98,7 +98,7 @@ def calibration_tables(
                 solver = context.calibrator.solver
                 known = parameter_intervals(solver, batch, last, parameters, settings)
                 rows = rows.join(pd.DataFrame(known.columns(), index=ids), on="pair_id")
-                tables = known.tables(ids, solver.seed)
+                tables = known.tables(ids)
             fits.append(rows)
     best = _parameters(evaluation, "fixed", ids, batch.leader_length)
     tables["slices"] = slices(context.calibrator, batch, last, best, ids)

@@ -45,6 +45,15 @@ class SignalErrors:
         return (speed - measured_speed,)
 
 
+def normal_draws(
+    mean: Tensor, covariance: Tensor, count: int, generator: torch.Generator
+) -> Tensor:
+    """Returns draws `(count, n)` of a normal distribution with a mean `(n,)`."""
+    normal = torch.randn((count, len(mean)), generator=generator, dtype=torch.float64)
+    found: Tensor = mean + normal @ torch.linalg.cholesky(covariance).mT
+    return found
+
+
 @dataclass(frozen=True)
 class ParameterPrior:
     """A prior on the logits of parameters in unit space.
@@ -101,10 +110,7 @@ class ParameterPrior:
         if self.center is None:
             places = torch.rand((drivers, n), generator=generator, dtype=torch.float64)
             return torch.logit(places, eps=1e-12)
-        normal = torch.randn((drivers, n), generator=generator, dtype=torch.float64)
-        factor = torch.linalg.cholesky(torch.linalg.inv(self.precision))
-        found: Tensor = self.center + normal @ factor.mT
-        return found
+        return normal_draws(self.center, torch.linalg.inv(self.precision), drivers, generator)
 
     def cut(self, drivers: Tensor) -> ParameterPrior:
         """Returns the prior of some drivers."""

@@ -61,7 +61,8 @@ class ParameterIntervals:
         effective_samples: `(P,)`, effective sample size that the quantiles rest on.
         pareto_k: `(P,)`, above 0.7 the intervals are not to be relied on.
         draws: parameters, `(P, DRAWS, n)`, SI units: as correlated as a recording leaves them.
-        prior: parameters of drivers who have no recording, `(NEW_DRIVERS, n)`, SI units.
+        new_drivers: parameters of drivers who have no recording, `(NEW_DRIVERS, n)`, SI units: of
+            the population, or as the prior has them.
         fan: of trajectories.
         population: from which all drivers come, if it was asked for.
     """
@@ -77,7 +78,7 @@ class ParameterIntervals:
     effective_samples: Tensor
     pareto_k: Tensor
     draws: Tensor
-    prior: Tensor
+    new_drivers: Tensor
     fan: Fan
     population: Population | None = None
 
@@ -91,27 +92,22 @@ class ParameterIntervals:
             found[kind] = getattr(self, kind).numpy()
         return found
 
-    def tables(self, ids: Sequence[str], seed: int) -> dict[str, pd.DataFrame]:
+    def tables(self, ids: Sequence[str]) -> dict[str, pd.DataFrame]:
         """Returns `posterior`, draws of each driver's parameters, `prior` and `fan`.
 
         Where a population was asked for, `population`, new drivers of it, stands for `prior`.
 
         Args:
             ids: of the pairs.
-            seed: of the new drivers.
         """
         columns = [f"parameter_{name}" for name in self.names]
         pairs, draws, _ = self.draws.shape
         values = pd.DataFrame(self.draws.flatten(0, 1).numpy(), columns=columns)
         values.insert(0, "pair_id", np.repeat(np.asarray(ids, dtype=object), draws))
         values.insert(1, "draw", np.tile(np.arange(draws), pairs))
-        found = {"posterior": values, "fan": self.fan.table(ids)}
-        if self.population is None:
-            found["prior"] = pd.DataFrame(self.prior.numpy(), columns=columns)
-        else:
-            drawn = self.population.draw(NEW_DRIVERS, seed=seed).numpy()
-            found["population"] = pd.DataFrame(drawn, columns=columns)
-        return found
+        new = pd.DataFrame(self.new_drivers.numpy(), columns=columns)
+        name = "prior" if self.population is None else "population"
+        return {"posterior": values, "fan": self.fan.table(ids), name: new}
 
 
 def parameter_intervals(
@@ -158,7 +154,11 @@ def parameter_intervals(
         seed=solver.seed,
         memory=solver.memory,
     )
-    before = posterior.prior.draw(NEW_DRIVERS, len(space), seed=solver.seed)
+    if population is None:
+        before = posterior.prior.draw(NEW_DRIVERS, len(space), seed=solver.seed)
+        new_drivers = space.from_unit(torch.sigmoid(before))
+    else:
+        new_drivers = population.draw(NEW_DRIVERS, seed=solver.seed)
     return ParameterIntervals(
         space.names,
         low,
@@ -171,7 +171,7 @@ def parameter_intervals(
         effective_samples=found.effective,
         pareto_k=found.pareto_k,
         draws=space.from_unit(torch.sigmoid(found.draws[..., : len(space)])),
-        prior=space.from_unit(torch.sigmoid(before)),
+        new_drivers=new_drivers,
         fan=fan,
         population=population,
     )

@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cfx.calibration.posterior.density import ParameterPrior, Posterior
+from cfx.calibration.posterior.density import ParameterPrior, Posterior, normal_draws
 from cfx.calibration.posterior.laplace import Normal, laplace
 from cfx.core.parameters import ParameterSpace
 
@@ -60,10 +60,8 @@ class Population:
     def draw(self, drivers: int, *, seed: int = 0) -> Tensor:
         """Returns parameters of new drivers, `(drivers, n)`, SI units, as correlated as theirs."""
         generator = torch.Generator().manual_seed(seed)
-        shape = (drivers, len(self.mean))
-        normal = torch.randn(shape, generator=generator, dtype=torch.float64)
-        factor = torch.linalg.cholesky(self.covariance)
-        return self.space.from_unit(torch.sigmoid(self.mean + normal @ factor.mT))
+        logits = normal_draws(self.mean, self.covariance, drivers, generator)
+        return self.space.from_unit(torch.sigmoid(logits))
 
 
 def fit_population(posterior: Posterior, starts: Tensor) -> tuple[Population, Posterior, Normal]:
