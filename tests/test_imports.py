@@ -34,8 +34,6 @@ HEIGHT = {room: height for height, floor in enumerate(FLOORS) for room in floor}
 HEAVY = (
     "torch",
     "lightning",
-    "botorch",
-    "gpytorch",
     "mlflow",
     "pandas",
     "matplotlib",

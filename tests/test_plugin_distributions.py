@@ -29,13 +29,10 @@ READERS = {
     "cfx.data.tracks",
 }
 FIGURES = {
-    "cfx.figures.calibration",
     "cfx.figures.canvas",
     "cfx.figures.figure",
-    "cfx.figures.improvements",
     "cfx.figures.job",
     "cfx.figures.text",
-    "cfx.figures.trajectories",
     "cfx.figures.write",
 }
 RESULTS = {

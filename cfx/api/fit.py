@@ -180,13 +180,8 @@ class Fit:
 
     def plot(self) -> Figure:
         """Draws the parameters between their bounds, and how they go together."""
-        from cfx.figures.calibration import (
-            correlations,
-            draw_calibration,
-            parameter_spreads,
-        )
-        from cfx.figures.figure import ParameterAxis
-        from cfx.figures.write import for_notebooks
+        from cfx.figures.figure import ParameterAxis, Results
+        from cfx.figures.write import drawn
 
         tables = []
         for method in METHODS:
@@ -196,8 +191,7 @@ class Fit:
         axes = []
         for one in self._context.space.tuned:
             axes.append(ParameterAxis(one.name, one.unit, one.low, one.high, one.meaning))
-        figure = draw_calibration(parameter_spreads(rows, axes), correlations(rows, axes))
-        return for_notebooks(figure)
+        return drawn("calibration", Results(rows, METHODS, tuple(axes)))
 
     def _of(self, method: str) -> pd.DataFrame:
         """Returns a method's parameters, a row per pair."""

@@ -155,8 +155,8 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
 
     Args:
         source: the path or URL of a recording, a pattern, a list of them; or a data frame in the
-            tidy layout (pandas, or whatever has an Arrow interface, such as polars). None for a
-            dataset that reads no file.
+            tidy layout (pandas, xarray, or whatever has an Arrow interface, such as polars). None
+            for a dataset that reads no file.
         dataset: the dataset that reads it, as after `data=`; None: found from the file itself.
         settings: of the dataset: `min_frames=300`, `time_step=0.1`, `max_pairs=20` and so on; a
             table's own names and units: `columns={"speed": "v"}`, `units={"speed": "km/h"}`.
@@ -212,5 +212,6 @@ def _data_frame(source: Any) -> pd.DataFrame | None:
         frame: pd.DataFrame = pa.table(source).to_pandas()
         return frame
     if hasattr(source, "to_dataframe"):  # xarray
-        return cast(pd.DataFrame, source.to_dataframe().reset_index())
+        # On a grid of pairs and frames, cells beyond the end of a pair are empty.
+        return cast(pd.DataFrame, source.to_dataframe().dropna(how="all").reset_index())
     return None

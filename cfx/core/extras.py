@@ -53,6 +53,7 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("model", "ovm"): "cfx-classics",
     ("model", "ovm_city"): "cfx-classics",
     ("model", "sumo_vtype"): "cfx-sumo",
+    ("optimizer", "botorch"): "cfx-botorch",
     ("optimizer", "cma"): "cfx-cma",
     ("optimizer", "differential_evolution"): "cfx-scipy",
     ("policy", "particle_filter"): "cfx-estimators",

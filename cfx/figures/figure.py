@@ -15,7 +15,8 @@ import pandas as pd
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import PluginError
+from cfx.core.errors import DataError, listed, nearest
+from cfx.core.extras import install_line
 from cfx.evaluation.result import Purpose
 from cfx.simulation.trajectory import TRANSIENT_S
 
@@ -140,16 +141,23 @@ class JobFigure(Component):
         """
 
 
+def where_figures_are() -> str:
+    """Return how figures of jobs are installed."""
+    return f"Figures of jobs come with cfx-report: {install_line('cfx-report')}"
+
+
 def figure_named(name: str) -> registry.Installed[JobFigure]:
     """Return the figure of a name.
 
     Raises:
-        PluginError: there is none that works.
+        DataError: there is none that works.
     """
-    for one in registry.installed("figure"):
-        if one.name == name:
-            return one
-    raise PluginError(f"there is no figure '{name}'")
+    known = {one.name: one for one in registry.installed("figure")}
+    if name in known:
+        return known[name]
+    others = f"{nearest(name, known)} Known: {listed(list(known))}."
+    message = f"there is no figure '{name}'."
+    raise DataError(message + (others if known else f" {where_figures_are()}"))
 
 
 def draw(one: registry.Installed[JobFigure], results: Results) -> Figure | None:

@@ -269,3 +269,20 @@ def test_a_job_is_found_again_by_its_configuration(tmp_path: Path) -> None:
     assert changed["windows.length"] == "7"
     with pytest.raises(DataError, match="cannot be read"):
         cfx.from_config(tmp_path / "nothing.yaml")
+
+
+def test_a_grid_of_pairs_and_frames_has_no_rows_beyond_a_pairs_end(pairs: cfx.Pairs) -> None:
+    """As xarray holds pairs of different lengths."""
+    frame = pairs.frame
+    ids = frame["pair_id"].unique()
+    frame = frame[(frame["pair_id"] != ids[0]) | (frame["frame"] < frame["frame"].min() + 250)]
+    table = frame.set_index(["pair_id", "frame"])
+    grid = table.reindex(pd.MultiIndex.from_product(table.index.levels, names=table.index.names))
+
+    class Dataset:
+        def to_dataframe(self) -> pd.DataFrame:
+            return grid
+
+    settings = {"min_frames": 2, "accelerations": "recorded"}
+    expected = cfx.read(frame, **settings).selected.fingerprint
+    assert cfx.read(Dataset(), **settings).selected.fingerprint == expected

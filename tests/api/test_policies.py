@@ -117,6 +117,20 @@ def test_a_forecast_reads_nothing_after_its_moment(others: cfx.Pairs) -> None:
     assert found[0].paths.groupby("pair_id").size().tolist() == [31, 31]
 
 
+def test_a_forecast_is_that_of_the_protocol_to_the_last_bit(others: cfx.Pairs) -> None:
+    policy = "cfx://i80-idm"
+    settings = {"protocol.horizons": [2.0], "protocol.stride": 60.0}  # one moment
+    result = cfx.evaluate(policy, others, protocol="forecast", **RANDOM, **settings)
+    assert result.evaluation is not None
+    errors = result.evaluation.tables["forecasts"].query("method == 'policy'")
+    at = float(errors["history_s"].max())
+    errors = errors[errors["history_s"] == at]
+    future = cfx.forecast(policy, others, at=at, horizon=2.0)
+    paths, measured = (one.set_index("pair_id") for one in (future.paths, future.measured))
+    left = (paths["speed"] - measured["speed"]).groupby("pair_id").last()
+    assert errors.set_index("pair_id")["speed_error"].to_dict() == left.to_dict()
+
+
 def test_a_forecast_ends_where_what_is_given_ends(others: cfx.Pairs) -> None:
     given = cfx.forecast("cfx://i80-idm", others, at=28.0, horizon=5.0)
     assert given.paths["time_s"].max() == pytest.approx(29.9)

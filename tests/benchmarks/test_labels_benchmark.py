@@ -22,7 +22,6 @@ from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives.rmse import SpeedRmse
-from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.models.base import DrivingModel, Leader
@@ -30,6 +29,7 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Segments, Start
+from cfx_botorch.optimizer import BotorchOptimizer
 
 WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 4
 

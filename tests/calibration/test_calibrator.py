@@ -19,7 +19,6 @@ from cfx.calibration.objectives.mixed import Mixed
 from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
 from cfx.calibration.objectives.theil import TheilU
 from cfx.calibration.optimizers.base import CandidateLosses, Optimizer
-from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.shards import CalibrationShard, Solver
@@ -33,6 +32,7 @@ from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Windows, WindowSettings
+from cfx_botorch.optimizer import BotorchOptimizer
 from tests.drives import straight_pairs, wavy_pairs
 
 SETTINGS = WindowSettings()

@@ -15,7 +15,6 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives.rmse import SpeedRmse
 from cfx.calibration.optimizers.base import Optimizer
-from cfx.calibration.optimizers.botorch import BotorchOptimizer
 from cfx.calibration.optimizers.gradient import GradientSearch
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.prior import Prior, prior_weight
@@ -25,6 +24,7 @@ from cfx.data.pairs import PairBatch
 from cfx.models.base import Follower, Leader
 from cfx.models.idm import IDM
 from cfx.simulation.rollout import MemoryStepper
+from cfx_botorch.optimizer import BotorchOptimizer
 from tests.drives import wavy_pairs
 
 MODEL = IDM()

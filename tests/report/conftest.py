@@ -7,14 +7,14 @@ from contextlib import contextmanager
 
 import pytest
 
-from cfx.figures import write
+from cfx_report import inline
 
 
 @contextmanager
 def blank_drawings() -> Iterator[None]:
     """Makes pages quick that are looked at for something else than their figures."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(write, "inline_svg", lambda _: '<svg viewBox="0 0 1 1"></svg>')
+        patch.setattr(inline, "inline_svg", lambda _: '<svg viewBox="0 0 1 1"></svg>')
         yield
 
 

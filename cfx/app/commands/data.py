@@ -109,12 +109,15 @@ def _describe(options: argparse.Namespace) -> None:
 
 def _draw(style: StyleResult, distances: pd.DataFrame | None, path: Path) -> None:
     """Draws the driving styles of sites into a file."""
-    from cfx.core.files import atomic_write
-    from cfx.figures.site_styles import draw_site_styles
+    import pandas as pd
 
-    figure = draw_site_styles(style, distances)
-    with atomic_write(path) as temporary:
-        figure.savefig(temporary, format=path.suffix[1:])
+    from cfx.figures.figure import Results
+    from cfx.figures.write import drawn, write_figure
+
+    tables = {} if distances is None else {"style_distances": distances}
+    write_figure(
+        drawn("site_styles", Results(pd.DataFrame(), (), (), style=style, tables=tables)), path
+    )
     print(f"\nFigure: {path}")
 
 

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import pandas as pd
 import yaml
 
+from cfx.core import registry
 from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write, remove_leftovers, write_json
 from cfx.core.storage import RemoteFolder
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from cfx.app.job.steps import Parts
     from cfx.evaluation.demo import Demo
 
+
+log = logging.getLogger(__name__)
 
 METRICS = "metrics.json"
 """The file that is written last: a folder that has it is complete."""
@@ -172,9 +175,11 @@ def _write_figures(
     tables: list[WrittenTable],
     metrics: Mapping[str, float],
 ) -> list[Path]:
-    from cfx.figures.figure import Results
+    from cfx.figures.figure import Results, where_figures_are
     from cfx.figures.write import write_figures
 
+    if not registry.installed("figure"):
+        log.warning("No figures are drawn. %s", where_figures_are())
     rows = {table.about.name: table.rows for table in tables if table.rows is not None}
     results = Results.of(findings.evaluation, style=findings.style, tables=rows, metrics=metrics)
     return write_figures(folder / "figures", results, formats=config.figures.formats)
@@ -221,8 +226,6 @@ def _description(findings: Findings, objective: Mapping[str, str]) -> dict[str, 
         "commit": commit(Path.cwd()),
     }
 
-
-log = logging.getLogger(__name__)
 
 _CONFIG = "config.yaml"
 

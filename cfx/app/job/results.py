@@ -11,8 +11,7 @@ import pandas as pd
 
 from cfx.app.job import output
 from cfx.app.overrides import command_of
-from cfx.core import registry
-from cfx.core.errors import ConfigError, DataError, listed, nearest
+from cfx.core.errors import ConfigError, DataError, listed
 from cfx.core.guest import guest, visit
 from cfx.core.job_folder import examine, parse_yaml, read_metrics
 from cfx.data.style import StyleResult
@@ -138,18 +137,9 @@ class JobResult:
         Raises:
             DataError: there is no such figure, or the job has nothing of what it shows.
         """
-        from cfx.figures.figure import draw
-        from cfx.figures.write import for_notebooks
+        from cfx.figures.write import drawn
 
-        known = {one.name: one for one in registry.installed("figure")}
-        if name not in known:
-            raise DataError(
-                f"there is no figure '{name}'.{nearest(name, known)} Known: {listed(list(known))}."
-            )
-        figure = draw(known[name], self._results)
-        if figure is None:
-            raise DataError(f"the job has nothing of what the figure '{name}' shows")
-        return for_notebooks(figure)
+        return drawn(name, self._results)
 
     @cached_property
     def _results(self) -> Results:

@@ -11,7 +11,7 @@ from abc import abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from threading import Event
-from typing import ClassVar, Protocol
+from typing import Any, ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import PluginError
+from cfx.core.errors import ConfigError, PluginError
 from cfx.core.memory import require_memory
 from cfx.core.threads import cores, share
 
@@ -383,3 +383,27 @@ class _CheckedLosses:
             self._optimizer,
             self._ended,
         )
+
+
+def check_room(evaluations: int, guesses: int, *, key: str) -> None:
+    """Checks that the setting `key` allows as many evaluations as there are first guesses.
+
+    Raises:
+        ConfigError: it does not.
+    """
+    if evaluations < guesses:
+        raise ConfigError(
+            f"optimizer.{key}={evaluations}: there are {guesses} first guesses;"
+            f" set optimizer.{key} >= {guesses}"
+        )
+
+
+def sobol(count: int, n: int, *, seed: int, like: Tensor) -> Tensor:
+    """Returns scrambled Sobol points `(count, n)` within [0, 1], float64, on `like`'s device."""
+    if count == 0:
+        return like.new_empty((0, n))
+    # torch leaves the engine untyped.
+    make: Any = torch.quasirandom.SobolEngine
+    engine = make(n, scramble=True, seed=seed)
+    points: Tensor = engine.draw(count, dtype=torch.float64)
+    return points.to(like.device)

@@ -13,8 +13,14 @@ import torch
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from cfx.calibration.optimizers.base import AT_ONCE, CandidateLosses, Optimizer, Tried
-from cfx.calibration.optimizers.random import check_room, sobol
+from cfx.calibration.optimizers.base import (
+    AT_ONCE,
+    CandidateLosses,
+    Optimizer,
+    Tried,
+    check_room,
+    sobol,
+)
 from cfx.core.component import Settings
 
 _DIFFERENCE = 1e-6

@@ -15,9 +15,15 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.calibration.optimizers.base import AT_ONCE, CandidateLosses, Optimizer, Tried
+from cfx.calibration.optimizers.base import (
+    AT_ONCE,
+    CandidateLosses,
+    Optimizer,
+    Tried,
+    check_room,
+    sobol,
+)
 from cfx.core.component import Settings
-from cfx.core.errors import ConfigError
 
 
 class RandomSettings(Settings):
@@ -56,27 +62,3 @@ class RandomSearch(Optimizer):
         blocks = (guesses, points.expand(problems, -1, -1))
         losses = torch.cat([objective(guesses), objective(blocks[1])], dim=1)
         return blocks, losses
-
-
-def check_room(evaluations: int, guesses: int, *, key: str) -> None:
-    """Checks that the setting `key` allows as many evaluations as there are first guesses.
-
-    Raises:
-        ConfigError: it does not.
-    """
-    if evaluations < guesses:
-        raise ConfigError(
-            f"optimizer.{key}={evaluations}: there are {guesses} first guesses;"
-            f" set optimizer.{key} >= {guesses}"
-        )
-
-
-def sobol(count: int, n: int, *, seed: int, like: Tensor) -> Tensor:
-    """Returns scrambled Sobol points `(count, n)` within [0, 1], float64, on `like`'s device."""
-    if count == 0:
-        return like.new_empty((0, n))
-    # torch leaves the engine untyped.
-    make: Any = torch.quasirandom.SobolEngine
-    engine = make(n, scramble=True, seed=seed)
-    points: Tensor = engine.draw(count, dtype=torch.float64)
-    return points.to(like.device)

@@ -29,7 +29,7 @@ from cfx.figures.text import (
     plural,
     short_label,
 )
-from cfx.figures.write import inline_scripts, security_policy
+from cfx_report.inline import inline_scripts, security_policy
 from cfx_report.jobs import Runs, of_purpose
 from cfx_report.names import Row, rows_over_seeds
 from cfx_report.section import MOST, Section, View, lacking
@@ -145,7 +145,7 @@ def _placed(svg: str, place: str) -> Any:
     """Returns an `svg` element with ids of its own, at a place of the page."""
     from markupsafe import Markup
 
-    from cfx.figures.write import PLACE
+    from cfx_report.inline import PLACE
 
     return Markup(svg.replace(PLACE, f"{place}-"))  # noqa: S704 - Matplotlib escapes all texts
 

@@ -35,7 +35,7 @@ class View:
     @property
     def svg(self) -> str:
         """The drawing as an `svg` element."""
-        from cfx.figures.write import inline_svg
+        from cfx_report.inline import inline_svg
 
         return inline_svg(self.drawing)
 

@@ -10,13 +10,13 @@ from hypothesis import strategies as st
 
 from cfx.data.style import StyleResult
 from cfx.evaluation.tables import scope_label
-from cfx.figures.calibration import correlations, parameter_spreads, spread_offsets
 from cfx.figures.figure import ParameterAxis
-from cfx.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
 from cfx.figures.text import common_prefix, short
-from cfx.figures.trajectories import evenly_spread, rank_pairs
+from cfx_report.figures.calibration import correlations, parameter_spreads, spread_offsets
+from cfx_report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
 from cfx_report.figures.jobs import error_limit
 from cfx_report.figures.style import draw_style
+from cfx_report.figures.trajectories import evenly_spread, rank_pairs
 from cfx_report.runs import natural_order
 
 GAIN = st.floats(-50, 1) | st.sampled_from([np.nan, -np.inf])

@@ -17,14 +17,14 @@ from cfx.core.errors import ConfigError, OutputError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.figures.figure import Results, draw, figure_named
-from cfx.figures.improvements import amounts_of
 from cfx.figures.text import COLOURS, percent, pretty_unit, short, unit_label
-from cfx.figures.trajectories import drives
 from cfx.figures.write import write_figure, write_figures
 from cfx.learners.curves import over_networks
 from cfx_forecasts.figures import errors_over_time
+from cfx_report.figures.improvements import amounts_of
 from cfx_report.figures.learning import SAMPLED
 from cfx_report.figures.platoon import braking_time, worst_platoon
+from cfx_report.figures.trajectories import drives
 from tests.made_up import GAINS, MadeUp, make_history, make_platoon, make_results
 
 TEN = ParameterSpace.of(

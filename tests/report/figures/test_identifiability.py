@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.figures.calibration import (
+from cfx.figures.figure import ParameterAxis
+from cfx_report.figures.calibration import (
     draw_fits,
     draw_labels,
     draw_slices,
@@ -16,7 +17,6 @@ from cfx.figures.calibration import (
     labels_of,
     slice_panels,
 )
-from cfx.figures.figure import ParameterAxis
 from cfx_report.page import render
 from cfx_report.runs import read_runs
 from cfx_report.sections import calibration

@@ -11,19 +11,8 @@ import pytest
 from matplotlib.axes import Axes
 
 from cfx.evaluation.result import Evaluation
-from cfx.figures.calibration import correlations, draw_calibration, parameter_spreads
 from cfx.figures.figure import Results, parameter_axes
-from cfx.figures.improvements import draw_improvements, improvement_bars
 from cfx.figures.text import colour_of
-from cfx.figures.trajectories import (
-    PairPanels,
-    draw_pair,
-    draw_pairs,
-    draw_parameters,
-    drives,
-    pair_panels,
-    rank_pairs,
-)
 from cfx.learners.curves import over_networks
 from cfx_forecasts.distributions import centre_errors, summarize_distributions
 from cfx_forecasts.errors import errors_by_history, forecast_methods, summarize_forecasts
@@ -35,9 +24,20 @@ from cfx_forecasts.figures import (
     errors_over_time,
     pit_density,
 )
+from cfx_report.figures.calibration import correlations, draw_calibration, parameter_spreads
+from cfx_report.figures.improvements import draw_improvements, improvement_bars
 from cfx_report.figures.jobs import draw_every_pair
 from cfx_report.figures.learning import draw_learning, loss_quartiles
 from cfx_report.figures.platoon import braking_time, draw_platoons, worst_platoon
+from cfx_report.figures.trajectories import (
+    PairPanels,
+    draw_pair,
+    draw_pairs,
+    draw_parameters,
+    drives,
+    pair_panels,
+    rank_pairs,
+)
 from cfx_report.runs import read_runs
 from cfx_report.sections.figures import chosen_pairs
 from tests.made_up import (

@@ -18,7 +18,7 @@ from cfx.figures.canvas import (
 )
 from cfx.figures.figure import JobFigure, Results
 from cfx.figures.text import EDGE, colour_of, short
-from cfx.figures.trajectories import chosen_pairs
+from cfx_report.figures.trajectories import chosen_pairs
 
 _PAIRS = 3
 

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.figures.calibration import ParameterSpread, parameter_spreads
 from cfx.figures.canvas import (
     DASHES,
     canvas,
@@ -20,6 +19,7 @@ from cfx.figures.canvas import (
 )
 from cfx.figures.figure import JobFigure, Results
 from cfx.figures.text import colour_of, label, unit_label
+from cfx_report.figures.calibration import ParameterSpread, parameter_spreads
 
 _ACROSS = 5
 _BINS = (6, 30)

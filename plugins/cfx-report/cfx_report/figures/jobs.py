@@ -14,7 +14,6 @@ from matplotlib.ticker import FuncFormatter
 
 from cfx.data.style import CLUSTERS
 from cfx.evaluation.statistics import Improvement
-from cfx.figures.calibration import spread_offsets
 from cfx.figures.canvas import (
     Array,
     canvas,
@@ -26,12 +25,6 @@ from cfx.figures.canvas import (
     points,
     styled,
 )
-from cfx.figures.improvements import (
-    ImprovementAxis,
-    ImprovementBars,
-    improvement_axis,
-    vertical_improvements,
-)
 from cfx.figures.text import (
     INK,
     JOB_COLOURS,
@@ -42,6 +35,13 @@ from cfx.figures.text import (
     percent_or_undefined,
     plural,
     short,
+)
+from cfx_report.figures.calibration import spread_offsets
+from cfx_report.figures.improvements import (
+    ImprovementAxis,
+    ImprovementBars,
+    improvement_axis,
+    vertical_improvements,
 )
 
 _WIDE = 1.6

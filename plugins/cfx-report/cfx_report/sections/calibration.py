@@ -10,7 +10,10 @@ import numpy as np
 
 from cfx.calibration.identifiability import NEAR
 from cfx.evaluation.result import Purpose
-from cfx.figures.calibration import (
+from cfx.figures.job import Job
+from cfx.figures.text import number as shown
+from cfx.figures.text import short, unit_label
+from cfx_report.figures.calibration import (
     AT_BOUND,
     ParameterSpread,
     SlicePanel,
@@ -19,9 +22,6 @@ from cfx.figures.calibration import (
     parameter_spreads,
     slice_panels,
 )
-from cfx.figures.job import Job
-from cfx.figures.text import number as shown
-from cfx.figures.text import short, unit_label
 from cfx_report.jobs import Runs, of_purpose
 from cfx_report.section import Cell, Column, Section, Sheet, View, formatted, job_names, number
 

@@ -11,10 +11,10 @@ from cfx.core.registry import OWN, installed
 from cfx.data.site_styles import ALL
 from cfx.data.style import name_of_indicator
 from cfx.evaluation.result import Purpose
-from cfx.figures.improvements import BASE_LABELS, history_curves
 from cfx.figures.job import Job
 from cfx.figures.text import percent, plural, short_label
-from cfx.figures.trajectories import RankedPair, draw_pair, rank_pairs
+from cfx_report.figures.improvements import BASE_LABELS, history_curves
+from cfx_report.figures.trajectories import RankedPair, draw_pair, rank_pairs
 from cfx_report.jobs import Runs, are_calibrations, of_purpose
 from cfx_report.section import MOST, Column, Section, Sheet, View, interval, job_names, number
 

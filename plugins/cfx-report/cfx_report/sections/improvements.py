@@ -15,9 +15,9 @@ from cfx.core.job_folder import without_folders
 from cfx.data.style import CLUSTERS
 from cfx.evaluation.result import Purpose
 from cfx.evaluation.statistics import Improvement
-from cfx.figures.improvements import improvement_axis, improvement_bars
 from cfx.figures.job import Job
 from cfx.figures.text import explained, label, short_label
+from cfx_report.figures.improvements import improvement_axis, improvement_bars
 from cfx_report.figures.jobs import ClusterGroup, draw_clusters, draw_every_pair
 from cfx_report.jobs import Runs, any_baselines, of_purpose
 from cfx_report.names import SEPARATOR, differences

@@ -13,8 +13,8 @@ from cfx.core.files import atomic_write
 from cfx.evaluation.result import Evaluation
 from cfx.figures.figure import Results
 from cfx.figures.text import COLOURS, label
-from cfx.figures.write import embedded_json, inline_scripts, security_policy
 from cfx.policies.agent import Agent
+from cfx_report.inline import embedded_json, inline_scripts, security_policy
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
 from cfx_sumo.demo.simulated import Array, SimulatedPair
@@ -153,8 +153,8 @@ class _Plot(NamedTuple):
 
 def _plots(evaluation: Evaluation) -> list[_Plot]:
     """Draws each pair; the axes' places are where the page puts its line of time."""
-    from cfx.figures.trajectories import draw_pair
-    from cfx.figures.write import PLACE, inline_svg
+    from cfx_report.figures.trajectories import draw_pair
+    from cfx_report.inline import PLACE, inline_svg
 
     results = Results.of(evaluation)
     found = []

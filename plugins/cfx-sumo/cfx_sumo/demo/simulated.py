@@ -19,9 +19,9 @@ from cfx import Pair, PairBatch, PairSet
 from cfx.core.errors import DataError, SumoError
 from cfx.core.processes import worker_pool
 from cfx.evaluation.result import Evaluation, PairTrajectory
-from cfx.figures.trajectories import evenly_spread
 from cfx.policies.agent import Agent
 from cfx.policies.placement import ALL
+from cfx_report.figures.trajectories import evenly_spread
 from cfx_sumo.demo.motorway import ABREAST, Motorway
 from cfx_sumo.demo.replay import FOLLOWERS, ReplayRequest, replay
 from cfx_sumo.installed import require_sumo

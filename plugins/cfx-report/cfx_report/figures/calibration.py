@@ -26,7 +26,7 @@ from cfx.figures.canvas import (
 )
 from cfx.figures.figure import JobFigure, ParameterAxis, Results
 from cfx.figures.text import EDGE, INK, colour_of, label, number, percent, plural, short, unit_label
-from cfx.figures.trajectories import TIME_TITLE
+from cfx_report.figures.trajectories import TIME_TITLE
 
 AT_BOUND = 0.01
 """So near to a bound, as a share of the distance between both, a value is at it."""

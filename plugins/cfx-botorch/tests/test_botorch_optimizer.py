@@ -4,11 +4,11 @@ import pytest
 import torch
 from botorch.models import SingleTaskGP
 
-from cfx.calibration.optimizers import botorch
-from cfx.calibration.optimizers.botorch import BotorchOptimizer
-from cfx.calibration.optimizers.random import RandomSearch
+import cfx
 from cfx.contracts.optimizers import Function, Problems, bowl, distance
 from cfx.core.errors import ConfigError
+from cfx_botorch import optimizer as botorch
+from cfx_botorch.optimizer import BotorchOptimizer
 
 
 @pytest.mark.parametrize("function", [distance, pytest.param(bowl, marks=pytest.mark.slow)])
@@ -16,7 +16,7 @@ def test_forty_evaluations_beat_four_thousand_random_ones(function: Function) ->
     optima = torch.rand(20, 2, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     guesses = torch.full((20, 1, 2), 0.5, dtype=torch.float64)
     problems = Problems(function, optima)
-    searched = RandomSearch(samples=4096).minimize(problems, guesses, seed=0)
+    searched = cfx.get("optimizer", "random")(samples=4096).minimize(problems, guesses, seed=0)
     forty = BotorchOptimizer(screening=0)
     modelled = forty.minimize(problems, guesses, seed=0)
     assert forty.evaluations() == 40
@@ -72,7 +72,7 @@ def test_screening_helps_in_ten_dimensions() -> None:
     guesses = torch.full((12, 1, 10), 0.5, dtype=torch.float64)
     problems = Problems(distance, optima)
     found = BotorchOptimizer(screening=500, iterations=5).minimize(problems, guesses, seed=0)
-    searched = RandomSearch(samples=510).minimize(problems, guesses, seed=0)
+    searched = cfx.get("optimizer", "random")(samples=510).minimize(problems, guesses, seed=0)
     assert found.loss.mean() < searched.loss.mean()
 
 

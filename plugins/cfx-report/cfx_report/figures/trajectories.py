@@ -31,7 +31,6 @@ from cfx.figures.canvas import (
     styled,
 )
 from cfx.figures.figure import JobFigure, ParameterAxis, Results
-from cfx.figures.improvements import improvement_title
 from cfx.figures.text import (
     BAND,
     EDGE,
@@ -44,6 +43,7 @@ from cfx.figures.text import (
     short_label,
     unit_label,
 )
+from cfx_report.figures.improvements import improvement_title
 
 TIME_TITLE = "time from the start of the pair (s)"
 
