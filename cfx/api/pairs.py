@@ -140,8 +140,17 @@ class Pairs:
         seconds = self.summary["duration_s"].sum()
         return (
             f"Pairs({len(self)} pairs of {drivers} drivers, {seconds:.0f} s in steps of"
-            f" {self.selected.dt:g} s, from {self.selected.source})"
+            f" {self.selected.dt:g} s, from {self.selected.source}{self._left_out})"
         )
+
+    @property
+    def _left_out(self) -> str:
+        """Says which pairs reading has left out."""
+        reasons = []
+        for one in self.selected.dropped:
+            if one.unit == "pairs":
+                reasons.append(f"{one.count} {one.reason}")
+        return f"; left out: {', '.join(reasons)}" if reasons else ""
 
     def _repr_html_(self) -> str:
         from cfx.figures.write import as_html

@@ -286,3 +286,8 @@ def test_a_grid_of_pairs_and_frames_has_no_rows_beyond_a_pairs_end(pairs: cfx.Pa
     settings = {"min_frames": 2, "accelerations": "recorded"}
     expected = cfx.read(frame, **settings).selected.fingerprint
     assert cfx.read(Dataset(), **settings).selected.fingerprint == expected
+
+
+def test_pairs_say_what_reading_has_left_out(pairs: cfx.Pairs) -> None:
+    read = cfx.read(pairs.frame, min_frames=2, max_pairs=1)
+    assert repr(read).endswith("from the table; left out: 2 beyond max_pairs (1))")
