@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from cfx.api.experiment import Experiment, config
-from cfx.api.pairs import Pairs, PairsLike
+from cfx.api.pairs import Pairs, PairsLike, pairs_from
 from cfx.core.errors import ConfigError
 from cfx.core.guest import visit
 
@@ -299,9 +299,8 @@ def calibrate(
         True
     """
     chosen = {"model": model, "objective": objective, "seed": seed, **settings}
-    experiment = config(pairs, policy="fixed", protocol="within_driver", **chosen)
-    recording = experiment.pairs
-    assert recording is not None
+    recording = pairs_from(pairs)
+    experiment = config(recording, policy="fixed", protocol="within_driver", **chosen)
     with visit():
         context, parts = prepared(experiment, recording)
         from cfx.simulation.windows import Split

@@ -5,6 +5,7 @@ Shapes: P pairs, S paths of each, K steps.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, cast
 
@@ -13,8 +14,8 @@ import pandas as pd
 
 from cfx.api.experiment import config
 from cfx.api.fit import prepared
-from cfx.api.pairs import PairsLike
-from cfx.api.policies import PolicyLike, in_folder
+from cfx.api.pairs import PairsLike, pairs_from
+from cfx.api.policies import PolicyLike, in_folder, settings_of
 from cfx.core.errors import ConfigError
 from cfx.core.guest import visit
 
@@ -120,11 +121,9 @@ def forecast(
     import torch
 
     with in_folder(policy) as folder, visit():
-        experiment = config(
-            pairs, protocol="transfer", seed=seed, **settings, **{"protocol.run": folder}
-        )
-        assert experiment.pairs is not None
-        context, parts = prepared(experiment, experiment.pairs)
+        recording = pairs_from(pairs)
+        chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
+        context, parts = prepared(config(recording, **chosen), recording)
         finished = cast(Any, parts.protocol).finished
         finished.check(context.pairs)
         agent: Agent = finished.agent.to(context.batch.lengths.device)
@@ -134,7 +133,7 @@ def forecast(
                 " a stochastic one: cfx.train(pairs, for_='stochastic')"
             )
         origins = _origins(context, at)
-        steps = round(horizon / context.batch.dt)
+        steps = round(horizon / context.batch.dt) if math.isfinite(horizon) else 0
         if steps < 1:
             raise ConfigError(
                 f"horizon={horizon:g}: give one step of {context.batch.dt:g} s or more"
@@ -159,6 +158,8 @@ def _origins(context: ProtocolContext, at: float) -> Origins:
     from cfx.evaluation.forecasts import Origins
 
     batch = context.batch
+    if not math.isfinite(at):
+        raise ConfigError(f"at={at}: give a moment in seconds")
     frame = round(at / batch.dt)
     for pair in context.pairs:
         if not 1 <= frame < len(pair) - 1:

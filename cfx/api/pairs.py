@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -95,10 +95,13 @@ class Pairs:
     def select(self, pair_ids: Sequence[str]) -> Pairs:
         """Returns some of the pairs.
 
+        Args:
+            pair_ids: their ids, or one.
+
         Raises:
             DataError: there is no pair of such an id.
         """
-        wanted = set(pair_ids)
+        wanted = {pair_ids} if isinstance(pair_ids, str) else set(pair_ids)
         unknown = sorted(wanted - {pair.pair_id for pair in self.selected})
         if unknown:
             raise DataError(f"{self.selected.source}: there is no pair '{unknown[0]}'")
@@ -196,12 +199,27 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
         values = {key: value for key, value in node.items() if key != "name"}
         made = validate(TidySettings, values, where="data")
         return Pairs(FrameDataset(made, frame).load(), node)
-    paths = [source] if isinstance(source, str | Path) else list(source)
+    paths = [source] if isinstance(source, str | Path) else _paths(source)
     paths = [one if is_url(str(one)) else str(absolute(one)) for one in paths]
     own_columns = {"columns", "units"} & settings.keys()
     name = dataset or ("tidy" if own_columns else dataset_of(Path(str(paths[0]))))
     given["data.path"] = paths[0] if len(paths) == 1 else paths
     return Pairs.of(config_of({"data": name, **given}).data)
+
+
+def _paths(source: Any) -> list[str | Path]:
+    """Returns the paths of several recordings.
+
+    Raises:
+        ConfigError: it is no list of paths.
+    """
+    found = list(source) if isinstance(source, Iterable) else []
+    if not found or not all(isinstance(one, str | Path) for one in found):
+        raise ConfigError(
+            f"a {type(source).__name__} of this kind is no recording; give a path, a list of paths,"
+            " a data frame, or what cfx.read returned"
+        )
+    return found
 
 
 def pairs_from(given: PairsLike) -> Pairs:

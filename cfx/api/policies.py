@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from cfx.api.experiment import config
-from cfx.api.pairs import PairsLike
+from cfx.api.pairs import PairsLike, pairs_from
 from cfx.app.job.results import JobResult
 from cfx.app.overrides import IN_MEMORY
+from cfx.core.errors import ConfigError
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.results.store import folder_of
@@ -56,7 +57,7 @@ def train(
         >>> result.improvement(over="population").index[0]
         'mean'
     """
-    return config(pairs, experiment=for_, model=model, seed=seed, **settings).run()
+    return config(pairs_from(pairs), experiment=for_, model=model, seed=seed, **settings).run()
 
 
 def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings: Any) -> JobResult:
@@ -85,9 +86,23 @@ def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings:
         >>> result.pairs.shape[0]
         8
     """
-    chosen = {"protocol": "transfer", "seed": seed, **settings}
     with in_folder(policy) as folder:
-        return config(pairs, **chosen, **{"protocol.run": folder}).run()
+        chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
+        return config(pairs_from(pairs), **chosen).run()
+
+
+def settings_of(settings: Mapping[str, Any], folder: str) -> dict[str, Any]:
+    """Returns the settings of a call that tests the policy in a folder.
+
+    Raises:
+        ConfigError: one of them is the policy's own.
+    """
+    for key in settings:
+        if key.partition(".")[0] in {"model", "policy", "windows"}:
+            raise ConfigError(
+                f"{key}: the policy brings its model, its network and its windows; leave it out"
+            )
+    return {**settings, "protocol.run": folder}
 
 
 @contextmanager

@@ -5,7 +5,9 @@ Shapes: P followers, T frames.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from numbers import Real
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -28,6 +30,9 @@ if TYPE_CHECKING:
 
 _STANDSTILL_M, _TIME_GAP_S = 2.0, 1.5
 """Where a follower begins behind a given leader: so far, and so many seconds of their speed."""
+
+_FASTEST_MPS, _LONGEST_STEP_S = 100.0, 2.0
+"""Beyond these a leader's speeds or times are in another unit."""
 
 Parameters = Fit | Mapping[str, float] | pd.Series | pd.DataFrame | None
 """Parameters of followers: a fit's, one set for all, or a row for each."""
@@ -143,9 +148,13 @@ def _behind(
         raise DataError("leader: time_s must advance by a constant step, over two rows or more")
     if not (np.isfinite(speeds).all() and (speeds >= 0).all()):
         raise DataError("leader: speed must be finite and 0 or more, in m/s")
+    if dt > _LONGEST_STEP_S:
+        raise DataError(f"leader: time_s advances by {dt:g} a row; give seconds, in steps of 0.1 s")
+    if speeds.max() > _FASTEST_MPS:
+        raise DataError(f"leader: speed goes up to {speeds.max():g}; give m/s")
     dt = round(dt, 9)
-    start = float(speeds[0]) if speed is None else speed
-    ahead = _STANDSTILL_M + _TIME_GAP_S * start if gap is None else gap
+    start = float(speeds[0]) if speed is None else _at_least_0("speed", speed, "m/s")
+    ahead = _STANDSTILL_M + _TIME_GAP_S * start if gap is None else _at_least_0("gap", gap, "m")
     still = np.zeros(len(time))
     pairs = []
     for name in names:
@@ -166,6 +175,18 @@ def _behind(
         )
         pairs.append(pair)
     return PairSet(tuple(pairs), "the given leader")
+
+
+def _at_least_0(name: str, value: Any, unit: str) -> float:
+    """Returns where a follower starts.
+
+    Raises:
+        ConfigError: the value is no such number.
+    """
+    number = float(value) if isinstance(value, Real) else math.nan
+    if not (math.isfinite(number) and number >= 0):
+        raise ConfigError(f"{name}={value!r}: give a number of 0 {unit} or more")
+    return number
 
 
 def _leader_columns(leader: pd.DataFrame | pd.Series) -> tuple[Any, Any]:
@@ -211,7 +232,10 @@ def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict
     values = {}
     for name in table.columns.astype(str):
         model.space[name]  # says that it is unknown
-        values[name] = torch.tensor(table[name].to_numpy(np.float64))
+        column = table[name].to_numpy(np.float64)
+        if not np.isfinite(column).all():
+            raise ConfigError(f"parameters: {name} is NaN or infinite; give a number")
+        values[name] = torch.tensor(column)
     return values
 
 

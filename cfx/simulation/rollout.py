@@ -356,7 +356,7 @@ def _check_bounds(
             found = float(values[wrong].flatten()[0])
             raise ParameterError(
                 f"{name}={found:g} is outside its bounds, {low:g} to {high:g}"
-                f" {bounds[0].unit}; give a value within, or outside='allow'"
+                f" {bounds[0].unit}; give a value within"
             )
 
 

@@ -291,3 +291,30 @@ def test_a_grid_of_pairs_and_frames_has_no_rows_beyond_a_pairs_end(pairs: cfx.Pa
 def test_pairs_say_what_reading_has_left_out(pairs: cfx.Pairs) -> None:
     read = cfx.read(pairs.frame, min_frames=2, max_pairs=1)
     assert repr(read).endswith("from the table; left out: 2 beyond max_pairs (1))")
+
+
+@pytest.mark.parametrize(
+    ("given", "said"),
+    [
+        ({"gap": -3.0}, r"gap=-3.0: give a number of 0 m or more"),
+        ({"gap": float("nan")}, "gap=nan: give a number"),
+        ({"speed": "10"}, "speed='10': give a number of 0 m/s or more"),
+        ({"parameters": {"T": float("nan")}}, "T is NaN or infinite"),
+        ({"leader": LEADER.assign(speed=120.0)}, "speed goes up to 120; give m/s"),
+        ({"leader": LEADER.assign(time_s=LEADER["time_s"] * 100)}, "advances by 10 a row"),
+    ],
+)
+def test_a_follower_starts_from_numbers_that_mean_something(
+    given: dict[str, Any], said: str
+) -> None:
+    with pytest.raises(CfxError, match=said):
+        cfx.simulate("idm", **{"leader": LEADER, **given})
+
+
+@pytest.mark.parametrize("given", [None, 3, [1, 2], []])
+def test_what_is_no_recording_is_said(given: Any) -> None:
+    """Nothing falls back to a recording that nobody asked for."""
+    with pytest.raises(ConfigError, match=r"give a (path|file)"):
+        cfx.calibrate(given, "idm")
+    with pytest.raises(ConfigError, match=r"give a (path|file)"):
+        cfx.evaluate("cfx://i80-idm", given)

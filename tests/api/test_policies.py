@@ -160,5 +160,10 @@ def test_a_forecast_refuses_what_it_cannot_do(others: cfx.Pairs) -> None:
         cfx.forecast("cfx://i80-idm", others, at=10.0, samples=5)
     with pytest.raises(ConfigError, match=r"pair .* lasts 29.9 s"):
         cfx.forecast("cfx://i80-idm", others, at=40.0)
+    with pytest.raises(ConfigError, match="at=nan: give a moment"):
+        cfx.forecast("cfx://i80-idm", others, at=float("nan"))
+    for key in ("model", "policy.hidden_size", "windows"):
+        with pytest.raises(ConfigError, match=f"{key}: the policy brings its model"):
+            cfx.evaluate("cfx://i80-idm", others, **{key: "krauss"})
     with pytest.raises(DataError, match="i80-idn"):
         cfx.forecast("cfx://i80-idn", others, at=10.0)
