@@ -132,6 +132,8 @@ def program() -> NoReturn:
     except KeyboardInterrupt:
         code = 130
     ignore_signals()
+    # Python looks for cycles in all libraries as it ends, which takes seconds.
+    gc.freeze()
     sys.exit(code)
 
 
