@@ -40,6 +40,7 @@ RESULTS = {
     "cfx.core.files",
     "cfx.core.progress",
     "cfx.calibration.identifiability",
+    "cfx.calibration.posterior.levels",
     "cfx.core.component",
     "cfx.core.job_folder",
     "cfx.core.storage",

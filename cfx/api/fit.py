@@ -155,9 +155,10 @@ class Fit:
         Raises:
             ConfigError: no population was asked for (`calibration.posterior=hierarchical`).
         """
-        population = self._posterior.population
-        if population is None:
+        if self.experiment.config.calibration.posterior != "hierarchical":
             raise ConfigError(f"there is no population to draw from; {_ask_for('hierarchical')}")
+        population = self._posterior.population
+        assert population is not None
         names = [f"driver {number}" for number in range(drivers)]
         rows = population.draw(drivers, seed=seed).numpy()
         return pd.DataFrame(rows, names, self.parameters.columns)
