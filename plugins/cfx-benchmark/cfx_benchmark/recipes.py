@@ -25,6 +25,15 @@ drive unseen ones better than those that learn from cold starts alone."""
 _ONE_NETWORK = ("protocol.histories=[]", "learner.ensemble_size=1", "learner.drivers=128")
 """One network, of half as many drivers a step, instead of four: an eighth of the time."""
 
+_FORECAST = (
+    "learner.epochs=16",
+    "learner.learning_rate=0.003",
+    "learner.time_weighting=relative",
+    "learner.gradient_decay=0.95",
+    "learner.burn_in_s=5.0",
+)
+"""How experiment=forecast trains."""
+
 
 class Recipe(NamedTuple):
     """One policy.
@@ -50,6 +59,23 @@ RECIPES = {
         ("experiment=every_road", "protocol.histories=[]"),
         "Intelligent Driver Model for drivers with history on any road: it observes a driver, then"
         " drives as they do, beside their own parameters.",
+        EVERY_ROAD,
+    ),
+    "idm-stochastic": Recipe(
+        (
+            "experiment=every_road",
+            "protocol=forecast",
+            "protocol.samples=20",
+            "protocol.stride=5",
+            *_UNSEEN,
+            "policy.driver_features=[]",
+            "learner.head=stochastic",
+            *_FORECAST,
+            "learner.cold_start_fraction=1.0",
+            *_ONE_NETWORK[1:],
+        ),
+        "Intelligent Driver Model for unseen drivers of any road who vary as people do: each draws"
+        " their own parameters and noise, with a seed.",
         EVERY_ROAD,
     ),
     "idm-acc": Recipe(

@@ -72,8 +72,10 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
     assert "Valid range" in text
 
 
-def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated() -> None:
-    name = "i80-idm-stochastic"
+@pytest.mark.parametrize(
+    ("name", "least"), [("i80-idm-stochastic", 0.85), ("idm-stochastic", 0.78)]
+)
+def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated(name: str, least: float) -> None:
     agent = cfx.load(f"cfx://{name}").policy
     assert agent.is_stochastic
     frames = torch.full((2, agent.windows.length), 10.0, dtype=torch.float64)
@@ -92,7 +94,8 @@ def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated() -> None:
     rows = ready.card_of(name)["distributions"]
     assert [row["horizon_s"] for row in rows] == [0.5, 1.0, 2.0, 3.0, 5.0, 10.0]
     for row in rows:
-        assert 0.85 <= row["coverage"] <= 0.95
+        # Of drivers of roads that it does not know fewer are within the central 90 %.
+        assert least <= row["coverage"] <= 0.95
     text = (ready.FOLDER / name / "CARD.md").read_text(encoding="utf-8")
     assert "Sampled forecasts" in text
     assert "residual_scale" not in text
