@@ -21,7 +21,7 @@ def options_of(folder: Path) -> set[tuple[str, str]]:
         "entry-points"
     ]
     found = set()
-    for kind in (*registry.KINDS.values(), registry.PARTS["export"]):
+    for kind in (*registry.KINDS.values(), registry.PARTS["export"], registry.PARTS["posterior"]):
         for name in points.get(kind.entry_points, ()):
             found.add((kind.group, name))
     for path in folder.glob("cfx_*/conf/*/*.yaml"):

@@ -9,9 +9,10 @@ import pytest
 from rich.text import Text
 
 import cfx
-from cfx.core.errors import ConfigError
+from cfx.core.errors import ConfigError, PluginError
 from cfx.models.krauss import Krauss
 from cfx.results.known import KnownParameters
+from tests.conftest import Installer
 
 QUICK = [
     "debug=quick",
@@ -102,3 +103,54 @@ def test_another_simulator_is_refused() -> None:
     pytest.importorskip("libsumo")
     with pytest.raises(ConfigError, match="simulator=memory alone"):
         cfx.run([*QUICK, "model=krauss_sumo", "simulator=sumo", "calibration.posterior=laplace"])
+
+
+CERTAIN = """
+import numpy as np
+from cfx.calibration.posterior import DriverPosteriors, PosteriorMethod
+
+
+class Certain(DriverPosteriors):
+    def __init__(self, names, best):
+        self.names, self.best, self.draws = names, best, best[:, None]
+
+    def columns(self):
+        found = dict.fromkeys(
+            ("noise_scale", "noise_correlation", "noise_left", "effective_samples", "pareto_k"),
+            np.zeros(len(self.best)),
+        )
+        for number, name in enumerate(self.names):
+            for kind in ("low", "median", "high"):
+                found[f"{kind}_{name}"] = self.best[:, number].numpy()
+            found[f"contraction_{name}"] = np.ones(len(self.best))
+        return found
+
+    def tables(self, ids):
+        return {}
+
+    def draw_drivers(self, count, seed):
+        return self.best[:1].expand(count, -1)
+
+
+class CertainMethod(PosteriorMethod):
+    def find(self, solver, batch, last, best, settings):
+        return Certain(solver.space.names, best)
+"""
+
+
+def test_a_posterior_of_a_third_party_needs_a_class_and_an_entry_point(install: Installer) -> None:
+    point = {"cfx.posteriors": {"certain": "certain_posterior:CertainMethod"}}
+    install("somebody-else", point, {"certain_posterior.py": CERTAIN})
+    found = cfx.run([*QUICK, "hydra.run.dir=job", "calibration.posterior=certain"])
+    rows = pd.read_parquet("job/fits.parquet").query("method == 'fixed'").set_index("pair_id")
+    fixed = found.pairs.query("method == 'fixed'").set_index("pair_id")
+    for name in found.evaluation.names:
+        assert found.metrics[f"posterior/determined/{name}"] == 1
+        expected = fixed[f"parameter_{name}"]
+        pd.testing.assert_series_equal(rows[f"median_{name}"], expected, check_names=False)
+
+
+def test_a_posterior_that_is_not_there_is_named_before_any_work() -> None:
+    with pytest.raises(PluginError, match=r"calibration\.posterior=laplce: .*'laplace'"):
+        cfx.run([*QUICK, "hydra.run.dir=job", "calibration.posterior=laplce"])
+    assert not Path("job/pairs.csv").exists()

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from torch import Tensor
 
     from cfx.app.job.steps import Parts
-    from cfx.calibration.posterior.intervals import ParameterIntervals
+    from cfx.calibration.posterior import DriverPosteriors
     from cfx.evaluation.protocols.base import ProtocolContext
 
 METHODS = ("default", "population", "fixed")
@@ -155,23 +155,24 @@ class Fit:
         Raises:
             ConfigError: no population was asked for (`calibration.posterior=hierarchical`).
         """
-        if self.experiment.config.calibration.posterior != "hierarchical":
+        from cfx.calibration.posterior import posterior_method
+
+        asked = self.experiment.config.calibration.posterior
+        if asked == "none" or not posterior_method(asked).has_population:
             raise ConfigError(f"there is no population to draw from; {_ask_for('hierarchical')}")
-        population = self._posterior.population
-        assert population is not None
         names = [f"driver {number}" for number in range(drivers)]
-        rows = population.draw(drivers, seed=seed).numpy()
+        rows = self._posterior.draw_drivers(drivers, seed).numpy()
         return pd.DataFrame(rows, names, self.parameters.columns)
 
     @cached_property
-    def _posterior(self) -> ParameterIntervals:
-        from cfx.calibration.posterior.intervals import parameter_intervals
+    def _posterior(self) -> DriverPosteriors:
+        from cfx.calibration.posterior import posterior_method
 
         settings, context = self.experiment.config.calibration, self._context
         if settings.posterior == "none":
             raise ConfigError(f"there is no posterior; {_ask_for('laplace')}")
         with visit():
-            return parameter_intervals(
+            return posterior_method(settings.posterior).find(
                 context.calibrator.solver,
                 context.batch,
                 self._last,

@@ -20,7 +20,7 @@ class CalibrationSettings(Settings):
         description="weak: parameters that a recording does not determine stay near the model's"
         " default; none: as in the paper",
     )
-    posterior: Literal["none", "laplace", "hierarchical"] = Field(
+    posterior: str = Field(
         "none",
         description="intervals of each driver's parameters beside the point estimate. laplace: each"
         " driver alone; hierarchical: with a prior that all drivers of the job give; none: the"

@@ -123,6 +123,12 @@ PARTS: dict[str, Kind] = {
         Kind("figure", "cfx.figures.figure:JobFigure", chosen=False),
         Kind("head", "cfx.policies.heads.base:ParameterHead", group="learner.head", chosen=False),
         Kind("export", "cfx.core.command:ExportFormat", chosen=False),
+        Kind(
+            "posterior",
+            "cfx.calibration.posterior:PosteriorMethod",
+            group="calibration.posterior",
+            chosen=False,
+        ),
     )
 }
 """Kinds of classes that come in the same way, are no components to configure, and have no suite.

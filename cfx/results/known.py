@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from cfx.calibration.posterior.levels import DETERMINED, ENOUGH, LEVEL, RELIABLE
+from cfx.calibration.levels import DETERMINED, ENOUGH, LEVEL, RELIABLE
 from cfx.core.parameters import Parameter
 from cfx.results.table import Findings
 

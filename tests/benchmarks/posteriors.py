@@ -17,13 +17,8 @@ from scipy.stats import chisquare
 from scoringrules import crps_ensemble
 from torch import Tensor
 
+from cfx.calibration.levels import DETERMINED
 from cfx.calibration.optimizers.random import RandomSearch
-from cfx.calibration.posterior.density import Posterior
-from cfx.calibration.posterior.importance import DRAWS, sample
-from cfx.calibration.posterior.intervals import parameter_intervals, posterior_of
-from cfx.calibration.posterior.laplace import laplace, likely_starts
-from cfx.calibration.posterior.levels import DETERMINED
-from cfx.calibration.posterior.population import fit_population
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.data.pairs import PairBatch
@@ -34,7 +29,12 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Segments
-from tests.calibration.posterior.recordings import draw_recordings
+from cfx_posteriors.density import Posterior
+from cfx_posteriors.importance import DRAWS, sample
+from cfx_posteriors.intervals import LaplaceMethod, posterior_of
+from cfx_posteriors.laplace import laplace, likely_starts
+from cfx_posteriors.population import fit_population
+from tests.posteriors.recordings import draw_recordings
 
 I80 = "../shared/data/i80_reconstructed_pairs.parquet"
 SHARES = torch.linspace(0.05, 0.95, 19, dtype=torch.float64)
@@ -131,7 +131,7 @@ def recording(name: str) -> Iterator[str]:
         solver = Solver(MemoryStepper(model, batch.dt), RandomSearch(), seed=0)
         best = model.space.defaults().double().expand(len(batch), -1)
         started = time.process_time()
-        found = parameter_intervals(solver, batch, last, best, settings)
+        found = LaplaceMethod().find(solver, batch, last, best, settings)
         spent = time.process_time() - started
         rows = []
         for column, parameter in enumerate(found.names):

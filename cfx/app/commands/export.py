@@ -32,15 +32,16 @@ class ExportCommand(Command):
             required=True,
             help="sumo (cfx-sumo): fixed parameters, a vType distribution for each cluster"
             " (.add.xml); onnx (cfx-onnx): the policy with its driving model (.onnx); fmi"
-            " (cfx-fmi): the same as a co-simulation unit of FMI 3.0 (.fmu);"
+            " (cfx-fmi): the same as a co-simulation unit of FMI 3.0 (.fmu); netcdf"
+            " (cfx-posteriors): draws of each driver's parameters, for ArviZ (.nc);"
             " RUN#NETWORK for one of its networks",
         )
         complete_with(to, lambda _: registry.names("export"))
         parser.add_argument(
             "--output",
             metavar="FILE",
-            help="default: drivers.add.xml, driver.onnx or driver.fmu in the job's folder; here,"
-            " where RUN is no folder",
+            help="default: drivers.add.xml, driver.onnx, driver.fmu or posterior.nc in the job's"
+            " folder; here, where RUN is no folder",
         )
         return parser
 

@@ -18,6 +18,7 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.identifiability import slices, training_errors
 from cfx.calibration.objectives.base import Objective
 from cfx.calibration.optimizers.base import Optimizer
+from cfx.calibration.posterior import posterior_method
 from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
@@ -65,8 +66,8 @@ def calibration_tables(
             test_rmse_speed (m/s), train_rmse_gap, test_rmse_gap (m): on the part that
             driver-specific parameters were calibrated on, and on the test part, if there is one
             (`split`). With a posterior
-            the rows of `fixed` have its columns (`ParameterIntervals.columns`) for that part too.
-        posterior, fan, and prior or population: with a posterior, see `ParameterIntervals.tables`.
+            the rows of `fixed` have its columns (`DriverPosteriors.columns`) for that part too.
+        Further ones with a posterior, see `DriverPosteriors.tables`.
     """
     calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
     if not calibrated or not isinstance(context.simulator, MemoryStepper):
@@ -92,11 +93,9 @@ def calibration_tables(
             if context.split == 1:  # nothing was tested
                 rows = rows.drop(columns=["test_rmse_speed", "test_rmse_gap"])
             if method == "fixed" and settings.posterior != "none":
-                # SciPy's and ArviZ's statistics are imported for that alone.
-                from cfx.calibration.posterior.intervals import parameter_intervals
-
                 solver = context.calibrator.solver
-                known = parameter_intervals(solver, batch, last, parameters, settings)
+                method_of = posterior_method(settings.posterior)
+                known = method_of.find(solver, batch, last, parameters, settings)
                 rows = rows.join(pd.DataFrame(known.columns(), index=ids), on="pair_id")
                 tables = known.tables(ids)
             fits.append(rows)
@@ -277,11 +276,13 @@ def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
     protocol = make_protocol(config)
     config = complete(config, protocol)
     parts = Parts.of(config, protocol)
-    if config.calibration.posterior != "none" and not isinstance(parts.simulator, MemorySimulator):
-        raise ConfigError(
-            f"calibration.posterior={config.calibration.posterior} simulates each trajectory"
-            " thousands of times, which simulator=memory alone can; leave one of them out"
-        )
+    if config.calibration.posterior != "none":
+        posterior_method(config.calibration.posterior)  # one that is not there is named at once
+        if not isinstance(parts.simulator, MemorySimulator):
+            raise ConfigError(
+                f"calibration.posterior={config.calibration.posterior} simulates each trajectory"
+                " thousands of times, which simulator=memory alone can; leave one of them out"
+            )
     return config, parts
 
 

@@ -10,12 +10,12 @@ from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
-from cfx.calibration.posterior import noise
-from cfx.calibration.posterior.density import ParameterPrior, Posterior
-from cfx.calibration.posterior.population import Population
 from cfx.data.pairs import PairBatch
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import MemoryStepper
+from cfx_posteriors import noise
+from cfx_posteriors.density import ParameterPrior, Posterior
+from cfx_posteriors.population import Population
 from tests.drives import wavy_pairs
 
 DT, STRIDE = 0.1, 10

@@ -8,14 +8,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.calibration.posterior.importance import DRAWS, Sampled, sample
-from cfx.calibration.posterior.laplace import laplace, likely_starts
-from cfx.calibration.posterior.tempered import tempered
 from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from tests.calibration.posterior.recordings import Drawn, draw_recordings
+from cfx_posteriors.importance import DRAWS, Sampled, sample
+from cfx_posteriors.laplace import laplace, likely_starts
+from cfx_posteriors.tempered import tempered
+from tests.posteriors.recordings import Drawn, draw_recordings
 
 SHARES = torch.linspace(0.05, 0.95, 19, dtype=torch.float64)
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.calibration.posterior.laplace import laplace
-from cfx.calibration.posterior.population import Population, fit_population
 from cfx.models.krauss import Krauss
-from tests.calibration.posterior.recordings import draw_recordings
+from cfx_posteriors.laplace import laplace
+from cfx_posteriors.population import Population, fit_population
+from tests.posteriors.recordings import draw_recordings
 
 SPACE = Krauss().space
 TRUE = Population(

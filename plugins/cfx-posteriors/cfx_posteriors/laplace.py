@@ -18,8 +18,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.calibration.posterior import noise
-from cfx.calibration.posterior.density import Posterior
+from cfx_posteriors import noise
+from cfx_posteriors.density import Posterior
 
 _SPREAD, _LIKELY = 256, 3
 """Places all over the prior that are tried, and as many of them as searches start from."""

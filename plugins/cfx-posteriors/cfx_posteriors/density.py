@@ -17,9 +17,9 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.posterior import noise
 from cfx.core.parameters import ParameterSpace, squashed
 from cfx.simulation.kernel.keys import ComponentKey
+from cfx_posteriors import noise
 
 DEVIATION = 1.5
 """Standard deviation of a weak prior on each logit. A parameter whose default is in the middle is

@@ -29,10 +29,10 @@ import torch
 from arviz_stats.base.array import array_stats
 from torch import Tensor
 
-from cfx.calibration.posterior.density import Posterior
-from cfx.calibration.posterior.laplace import Normal, curvature
-from cfx.calibration.posterior.levels import RELIABLE
-from cfx.calibration.posterior.tempered import tempered
+from cfx.calibration.levels import RELIABLE
+from cfx_posteriors.density import Posterior
+from cfx_posteriors.laplace import Normal, curvature
+from cfx_posteriors.tempered import tempered
 
 SAMPLES = 100
 """Samples of a component at a single sample."""

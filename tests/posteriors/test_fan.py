@@ -7,9 +7,9 @@ from typing import Literal
 import pytest
 import torch
 
-from cfx.calibration.posterior.fan import fan_of
 from cfx.models.krauss import Krauss
-from tests.calibration.posterior.recordings import draw_recordings
+from cfx_posteriors.fan import fan_of
+from tests.posteriors.recordings import draw_recordings
 
 SHARES = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
 

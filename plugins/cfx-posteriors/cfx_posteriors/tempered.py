@@ -22,8 +22,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.calibration.posterior import noise
-from cfx.calibration.posterior.density import Posterior
+from cfx_posteriors import noise
+from cfx_posteriors.density import Posterior
 
 SAMPLES = 1000
 

@@ -22,9 +22,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cfx.calibration.posterior.density import ParameterPrior, Posterior, normal_draws
-from cfx.calibration.posterior.laplace import Normal, laplace
 from cfx.core.parameters import ParameterSpace
+from cfx_posteriors.density import ParameterPrior, Posterior, normal_draws
+from cfx_posteriors.laplace import Normal, laplace
 
 PSEUDO = 1.0
 """As many drivers as the prior of the population counts for."""

@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 
-from cfx.calibration.posterior import noise
-from cfx.calibration.posterior.density import ParameterPrior
-from cfx.calibration.posterior.laplace import laplace, likely_starts
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
-from tests.calibration.posterior.recordings import draw_recordings
+from cfx_posteriors import noise
+from cfx_posteriors.density import ParameterPrior
+from cfx_posteriors.laplace import laplace, likely_starts
+from tests.posteriors.recordings import draw_recordings
 
 
 def test_the_mode_is_higher_than_anything_near_it() -> None:

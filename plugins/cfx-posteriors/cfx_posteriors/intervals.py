@@ -5,7 +5,7 @@ Shapes: P drivers, n tuned parameters.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,18 +14,19 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from cfx.calibration.levels import LEVEL
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.posterior.density import ParameterPrior, Posterior
-from cfx.calibration.posterior.fan import Fan, fan_of
-from cfx.calibration.posterior.importance import sample
-from cfx.calibration.posterior.laplace import Normal, laplace, likely_starts
-from cfx.calibration.posterior.levels import LEVEL
-from cfx.calibration.posterior.population import Population, fit_population
+from cfx.calibration.posterior import DriverPosteriors, PosteriorMethod
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
-from cfx.core.parameters import squashed
+from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
 from cfx.simulation.trajectory import Segments
+from cfx_posteriors.density import ParameterPrior, Posterior
+from cfx_posteriors.fan import Fan, fan_of
+from cfx_posteriors.importance import sample
+from cfx_posteriors.laplace import Normal, laplace, likely_starts
+from cfx_posteriors.population import Population, fit_population
 
 _SHARES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
 
@@ -46,8 +47,8 @@ _OF_DRIVERS = (
 
 
 @dataclass(frozen=True)
-class ParameterIntervals:
-    """What P recordings say of parameters.
+class ParameterIntervals(DriverPosteriors):
+    """What P recordings say of parameters, as intervals and draws.
 
     Attributes:
         names: of the parameters.
@@ -61,10 +62,10 @@ class ParameterIntervals:
         effective_samples: `(P,)`, effective sample size that the quantiles rest on.
         pareto_k: `(P,)`, above 0.7 the intervals are not to be relied on.
         draws: parameters, `(P, DRAWS, n)`, SI units: as correlated as a recording leaves them.
-        new_drivers: parameters of drivers who have no recording, `(NEW_DRIVERS, n)`, SI units: of
-            the population, or as the prior has them.
-        fan: of trajectories.
-        population: from which all drivers come, if it was asked for.
+        make_fan: simulates the fan of trajectories.
+        origin: where drivers who were not recorded come from: the population, or as the prior has
+            them.
+        seed: of the job.
     """
 
     names: tuple[str, ...]
@@ -78,9 +79,9 @@ class ParameterIntervals:
     effective_samples: Tensor
     pareto_k: Tensor
     draws: Tensor
-    new_drivers: Tensor
-    fan: Fan
-    population: Population | None = None
+    make_fan: Callable[[], Fan]
+    origin: Population | PriorDrivers
+    seed: int
 
     def columns(self) -> dict[str, NDArray[np.float64]]:
         """Returns columns for a row per driver: `median_NAME`, `noise_scale` and so on."""
@@ -96,69 +97,116 @@ class ParameterIntervals:
         """Returns `posterior`, draws of each driver's parameters, `prior` and `fan`.
 
         Where a population was asked for, `population`, new drivers of it, stands for `prior`.
-
-        Args:
-            ids: of the pairs.
         """
         columns = [f"parameter_{name}" for name in self.names]
         pairs, draws, _ = self.draws.shape
         values = pd.DataFrame(self.draws.flatten(0, 1).numpy(), columns=columns)
         values.insert(0, "pair_id", np.repeat(np.asarray(ids, dtype=object), draws))
         values.insert(1, "draw", np.tile(np.arange(draws), pairs))
-        new = pd.DataFrame(self.new_drivers.numpy(), columns=columns)
-        name = "prior" if self.population is None else "population"
-        return {"posterior": values, "fan": self.fan.table(ids), name: new}
+        new = pd.DataFrame(self.draw_drivers(NEW_DRIVERS, self.seed).numpy(), columns=columns)
+        name = "population" if isinstance(self.origin, Population) else "prior"
+        return {"posterior": values, "fan": self.make_fan().table(ids), name: new}
+
+    def draw_drivers(self, count: int, seed: int) -> Tensor:
+        return self.origin.draw(count, seed=seed)
 
 
-def parameter_intervals(
+@dataclass(frozen=True)
+class PriorDrivers:
+    """Drivers as the prior has them.
+
+    Attributes:
+        space: of the parameters.
+        prior: of their logits.
+    """
+
+    space: ParameterSpace
+    prior: ParameterPrior
+
+    def draw(self, drivers: int, *, seed: int) -> Tensor:
+        """Returns parameters of new drivers, `(drivers, n)`, SI units."""
+        logits = self.prior.draw(drivers, len(self.space), seed=seed)
+        return self.space.from_unit(torch.sigmoid(logits))
+
+
+class LaplaceMethod(PosteriorMethod):
+    """Each driver alone: Laplace's approximation, corrected by weighted samples."""
+
+    def find(
+        self,
+        solver: Solver,
+        batch: PairBatch,
+        last: Tensor,
+        best: Tensor,
+        settings: CalibrationSettings,
+    ) -> ParameterIntervals:
+        posterior = posterior_of(solver, batch, last, settings)
+        origin = PriorDrivers(solver.space, posterior.prior)
+        normal = laplace(posterior, _starts(solver, posterior, best))
+        return _intervals(solver, batch, last, settings, (posterior, normal, origin))
+
+
+class HierarchicalMethod(PosteriorMethod):
+    """Each driver as one of a population, which all drivers of the job give."""
+
+    has_population = True
+
+    def find(
+        self,
+        solver: Solver,
+        batch: PairBatch,
+        last: Tensor,
+        best: Tensor,
+        settings: CalibrationSettings,
+    ) -> ParameterIntervals:
+        alone = posterior_of(solver, batch, last, settings)
+        population, posterior, normal = fit_population(alone, _starts(solver, alone, best))
+        return _intervals(solver, batch, last, settings, (posterior, normal, population))
+
+
+def _starts(solver: Solver, posterior: Posterior, best: Tensor) -> Tensor:
+    """Returns logits at which searches start, `(P, S, n)`: the point estimates among them."""
+    space = solver.space
+    best = squashed(space.to_unit(best.to("cpu", torch.float64)))
+    default = squashed(space.to_unit(space.defaults())).expand_as(best)
+    likely = likely_starts(posterior, solver.seed)
+    return torch.cat([best[:, None], default[:, None], likely], dim=1)
+
+
+def _intervals(
     solver: Solver,
     batch: PairBatch,
     last: Tensor,
-    best: Tensor,
     settings: CalibrationSettings,
+    found: tuple[Posterior, Normal, Population | PriorDrivers],
 ) -> ParameterIntervals:
     """Returns the intervals of each driver's parameters.
 
     Args:
-        solver: whose model, time step and objective count, and which bounds the memory.
-        batch: P pairs.
-        last: `(P,)`, the last frame that is compared; simulated from frame 0 in one closed loop.
-        best: `(P, n)`, the point estimates, SI units: searches start there too.
-        settings: prior, method and noise.
+        solver, batch, last, settings: as of `PosteriorMethod.find`.
+        found: the posteriors, Laplace's approximation of them, and where new drivers come from.
     """
-    posterior = posterior_of(solver, batch, last, settings)
+    posterior, normal, origin = found
     space = solver.space
-    best = squashed(space.to_unit(best.to("cpu", torch.float64)))
-    default = squashed(space.to_unit(space.defaults())).expand_as(best)
-    starts = torch.cat(
-        [best[:, None], default[:, None], likely_starts(posterior, solver.seed)], dim=1
-    )
-    population = None
-    if settings.posterior == "hierarchical":
-        population, posterior, normal = fit_population(posterior, starts)
-    else:
-        normal = laplace(posterior, starts)
     shares = torch.tensor(_SHARES, dtype=torch.float64)
-    found = sample(posterior, normal, shares, seed=solver.seed, memory=solver.memory)
+    sampled = sample(posterior, normal, shares, seed=solver.seed, memory=solver.memory)
     prior = posterior.prior.quantiles(shares, len(space))
-    width = (found.quantiles[:, 2] - found.quantiles[:, 0]) / (prior[2] - prior[0])
-    values = space.from_unit(torch.sigmoid(found.quantiles))
+    width = (sampled.quantiles[:, 2] - sampled.quantiles[:, 0]) / (prior[2] - prior[0])
+    values = space.from_unit(torch.sigmoid(sampled.quantiles))
     low, median, high = values.unbind(1)
     scale, correlation, left = _noise(posterior, normal)
-    whole = posterior_of(solver, batch, batch.lengths - 1, settings)
-    fan = fan_of(
-        replace(whole, stride=posterior.stride),
-        last.cpu(),
-        found.draws,
-        shares,
-        seed=solver.seed,
-        memory=solver.memory,
-    )
-    if population is None:
-        before = posterior.prior.draw(NEW_DRIVERS, len(space), seed=solver.seed)
-        new_drivers = space.from_unit(torch.sigmoid(before))
-    else:
-        new_drivers = population.draw(NEW_DRIVERS, seed=solver.seed)
+
+    def make_fan() -> Fan:
+        whole = posterior_of(solver, batch, batch.lengths - 1, settings)
+        return fan_of(
+            replace(whole, stride=posterior.stride),
+            last.cpu(),
+            sampled.draws,
+            shares,
+            seed=solver.seed,
+            memory=solver.memory,
+        )
+
     return ParameterIntervals(
         space.names,
         low,
@@ -168,12 +216,12 @@ def parameter_intervals(
         noise_scale=scale,
         noise_correlation=correlation,
         noise_left=left,
-        effective_samples=found.effective,
-        pareto_k=found.pareto_k,
-        draws=space.from_unit(torch.sigmoid(found.draws[..., : len(space)])),
-        new_drivers=new_drivers,
-        fan=fan,
-        population=population,
+        effective_samples=sampled.effective,
+        pareto_k=sampled.pareto_k,
+        draws=space.from_unit(torch.sigmoid(sampled.draws[..., : len(space)])),
+        make_fan=make_fan,
+        origin=origin,
+        seed=solver.seed,
     )
 
 

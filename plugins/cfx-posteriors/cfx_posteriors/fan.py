@@ -16,8 +16,8 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.calibration.posterior import noise
-from cfx.calibration.posterior.density import Posterior
+from cfx_posteriors import noise
+from cfx_posteriors.density import Posterior
 
 
 class Fan(NamedTuple):

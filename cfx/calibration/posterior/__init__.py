@@ -1,1 +1,0 @@
-"""What a calibration knows: posterior distributions of parameters, beside the point estimates."""

@@ -1,0 +1,115 @@
+"""`cfx export --to netcdf`: a job's posteriors as ArviZ and other programs read them.
+
+The file follows ArviZ's InferenceData: groups of labelled arrays, with a chain and a draw. Draws
+are independent, so there is one chain.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import cast
+
+import numpy as np
+import pandas as pd
+import xarray as xr
+
+from cfx import DrivingModel
+from cfx.core.command import ExportFormat
+from cfx.core.errors import DataError
+from cfx.core.files import write_output
+from cfx.core.job_folder import read_yaml
+from cfx.core.registry import create
+from cfx.results.store import folder_of
+from cfx.results.table import read_tables
+
+NAME = "posterior.nc"
+
+_PARAMETER = "parameter_"
+_DIAGNOSTICS = {
+    "pareto_k": "above 0.7 a driver's draws are not to be relied on",
+    "effective_samples": "effective sample size that the draws rest on",
+    "noise_scale": "what each step of the noise adds",
+    "noise_correlation": "of the noise with itself one step later",
+}
+
+
+class NetcdfExport(ExportFormat):
+    """Writes draws of each driver's parameters, of the prior or the population, and diagnostics."""
+
+    def write(self, run: str, output: Path | None) -> list[str]:
+        """Writes `posterior.nc`.
+
+        Raises:
+            DataError: the job has no posterior.
+            OutputError: the file cannot be written.
+        """
+        folder = folder_of(run)
+        if output is None:
+            output = (folder if Path(run).expanduser().is_dir() else Path()) / NAME
+        tables = read_tables(folder, "posterior", "prior", "population", "fits")
+        if "posterior" not in tables or "fits" not in tables:
+            raise DataError(
+                f"{run}: this job has found no posterior; run one with"
+                " calibration.posterior=laplace or hierarchical"
+            )
+        node = read_yaml(folder / "config.yaml")["model"]
+        tree = inference_data(tables, cast(DrivingModel, create("model", node)))
+        with tempfile.TemporaryDirectory(prefix="cfx-") as name:
+            path = Path(name, NAME)
+            tree.to_netcdf(path, engine="h5netcdf")
+            content = path.read_bytes()
+        write_output(output, content, "the posterior")
+        sizes = tree["posterior"].sizes
+        return [
+            f"{output}: {sizes['draw']} draws for each of {sizes['pair']} pairs, groups"
+            f" {', '.join(tree.children)}",
+            f'Read it: xarray.open_datatree("{output}"); ArviZ takes what that returns',
+        ]
+
+
+def inference_data(tables: Mapping[str, pd.DataFrame], model: DrivingModel) -> xr.DataTree:
+    """Returns a job's posteriors as labelled arrays.
+
+    Args:
+        tables: `posterior` and `fits` of a job, and `prior` or `population`.
+        model: of the job.
+
+    Returns:
+        `posterior`: (chain, draw, pair); `prior` or `population`: (chain, draw), drivers who were
+        not recorded; `diagnostics`: (pair). Values of parameters are in SI units.
+    """
+    draws = tables["posterior"]
+    pairs = draws["pair_id"].drop_duplicates().tolist()
+    names = [name for name in draws.columns if name.startswith(_PARAMETER)]
+    groups = {"posterior": _dataset(draws, names, model, pairs)}
+    for kind in ("prior", "population"):
+        if kind in tables:
+            groups[kind] = _dataset(tables[kind], names, model, None)
+    rows = tables["fits"].query("method == 'fixed'").set_index("pair_id").loc[pairs]
+    diagnostics = {}
+    for name, meaning in _DIAGNOSTICS.items():
+        diagnostics[name] = ("pair", rows[name].to_numpy(np.float64), {"long_name": meaning})
+    groups["diagnostics"] = xr.Dataset(diagnostics, coords={"pair": pairs})
+    return xr.DataTree.from_dict(groups)
+
+
+def _dataset(
+    table: pd.DataFrame, names: Sequence[str], model: DrivingModel, pairs: Sequence[str] | None
+) -> xr.Dataset:
+    """Returns draws of parameters, of some pairs or of nobody in particular."""
+    dims = ("chain", "draw") if pairs is None else ("chain", "draw", "pair")
+    variables = {}
+    for name in names:
+        # A pair stands after the other, each with its draws.
+        values = table[name].to_numpy(np.float64).reshape(1 if pairs is None else len(pairs), -1)
+        values = values if pairs is None else values.T[None]
+        parameter = model.space[name.removeprefix(_PARAMETER)]
+        about = {"units": parameter.unit, "long_name": parameter.meaning}
+        variables[parameter.name] = (dims, values, about)
+    draws = len(table) // (1 if pairs is None else len(pairs))
+    coords: dict[str, object] = {"chain": [0], "draw": np.arange(draws)}
+    if pairs is not None:
+        coords["pair"] = list(pairs)
+    return xr.Dataset(variables, coords=coords)

@@ -1,0 +1,64 @@
+"""The tables of posteriors."""
+
+from __future__ import annotations
+
+from cfx import Column, ResultTable
+
+PAIR = Column("pair_id", "", "the pair of leader and follower", "text")
+
+
+class PosteriorDraws(ResultTable):
+    """Draws of each driver's parameters from their posterior."""
+
+    meaning = (
+        "equally likely values of each driver's parameters, as correlated as the recording leaves"
+        " them (`calibration.posterior`)"
+    )
+    order = 211
+    columns = (
+        PAIR,
+        Column("draw", "1", "its number within the pair", "int"),
+        Column("parameter_NAME", "as of the parameter", "the parameter"),
+    )
+
+
+class PopulationDraws(ResultTable):
+    """New drivers of the population that all recordings give."""
+
+    meaning = (
+        "parameters of new drivers, as different and as correlated as the recorded ones"
+        " (`calibration.posterior=hierarchical`)"
+    )
+    order = 212
+    columns = (Column("parameter_NAME", "as of the parameter", "the parameter"),)
+
+
+class PriorDraws(ResultTable):
+    """Parameters of drivers before their recordings are seen."""
+
+    meaning = (
+        "parameters as likely as they are before a driver's recording is seen"
+        " (`calibration.posterior=laplace`)"
+    )
+    order = 213
+    columns = (Column("parameter_NAME", "as of the parameter", "the parameter"),)
+
+
+class Fan(ResultTable):
+    """What posteriors say of trajectories."""
+
+    meaning = (
+        "90 % of the trajectories of each driver's posterior: simulated on the part that was"
+        " calibrated on, then forecasts (`calibration.posterior`)"
+    )
+    order = 214
+    columns = (
+        PAIR,
+        Column("time_s", "s", "since the recording's start"),
+        Column("calibrated_on", "1", "whether this part was calibrated on", "bool"),
+        Column("signal", "", "`speed` (m/s) or `gap` (m)", "text"),
+        Column("measured", "m/s or m", "what was recorded"),
+        Column("low", "m/s or m", "5 % are below"),
+        Column("median", "m/s or m", "half are below"),
+        Column("high", "m/s or m", "5 % are above"),
+    )

@@ -1,0 +1,41 @@
+"""ArviZ reads what `cfx export --to netcdf` writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import arviz_base
+import numpy as np
+import pandas as pd
+import pytest
+import xarray as xr
+
+import cfx
+from cfx.core.errors import DataError
+from cfx_posteriors.netcdf import NetcdfExport
+
+
+@pytest.mark.parametrize(
+    ("method", "others"), [("laplace", "prior"), ("hierarchical", "population")]
+)
+def test_a_jobs_posterior_is_labelled_arrays(method: str, others: str, tmp_path: Path) -> None:
+    quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures.enabled=false"]
+    job = [f"hydra.run.dir={tmp_path}/job", "tracking.enabled=false"]
+    found = cfx.run([*quick, *job, f"calibration.posterior={method}"])
+    said = NetcdfExport().write(str(found.folder), None)
+    assert "200 draws for each of 4 pairs" in said[0]
+    tree = xr.open_datatree(tmp_path / "job" / "posterior.nc", engine="h5netcdf")
+    assert arviz_base.extract(tree).sizes == {"sample": 200, "pair": 4}
+    draws = pd.read_parquet(tmp_path / "job" / "posterior.parquet")
+    for pair_id, rows in draws.groupby("pair_id"):
+        one = tree["posterior"]["t_r"].sel(pair=pair_id, chain=0)
+        np.testing.assert_array_equal(one.to_numpy(), rows["parameter_t_r"])
+    assert tree["posterior"]["t_r"].attrs["units"] == "s"
+    new = pd.read_parquet(tmp_path / "job" / f"{others}.parquet")
+    np.testing.assert_array_equal(tree[others]["t_i"][0].to_numpy(), new["parameter_t_i"])
+    assert dict(tree["diagnostics"]["pareto_k"].sizes) == {"pair": 4}
+
+
+def test_a_job_without_a_posterior_has_none_to_write(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"cfx://i80-idm: this job has found no posterior"):
+        NetcdfExport().write("cfx://i80-idm", tmp_path / "x.nc")
