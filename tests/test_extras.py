@@ -64,6 +64,13 @@ def test_an_option_that_is_not_installed_says_what_installs_it(
     assert "Did you mean 'gipps'?" in explain(error, [])
 
 
+def test_a_kind_that_only_plugins_bring_says_which(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(registry, "entries", lambda kind: ())
+    said = r"calibration.posterior=laplace: there is no .* It comes with cfx-posteriors: .* install"
+    with pytest.raises(PluginError, match=said):
+        registry.entry("posterior", "laplace")
+
+
 def test_the_registry_says_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [one for one in registry.entries("optimizer") if one.name != "cma"]
     monkeypatch.setattr(registry, "entries", lambda kind: entries)

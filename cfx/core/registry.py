@@ -249,7 +249,7 @@ def entry(kind: str, name: str) -> Entry:
             found.append(candidate)
     if not found:
         known = names(kind)
-        if not known:
+        if not known and about.name in KINDS:
             raise PluginError(
                 f"{call}: no {what} is installed, not even cfx's own;"
                 " run make run, or pip install -e ."
