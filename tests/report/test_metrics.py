@@ -13,7 +13,7 @@ from cfx.figures.job import known_metrics
 from cfx_report.runs import read_runs
 from cfx_report.section import Sheet
 from cfx_report.sections.comparison import every_metric
-from cfx_report.sections.results import all_metrics
+from cfx_report.sections.results import all_metrics, errors
 from tests.report.folders import write_job
 from tests.report.test_page import page_of
 
@@ -88,6 +88,17 @@ def test_a_metric_that_metrics_json_lacks_is_summarised_from_its_pairs(tmp_path:
     assert job.metric("comfort", "default") == 2.0
     assert pd.isna(job.metric("comfort", "fixed"))
     assert pd.isna(job.metric("comfort", "policy", "steady"))
+
+
+def test_the_error_to_expect_stands_beside_the_errors(tmp_path: Path) -> None:
+    write_job(tmp_path / "a", model="a", pairs=4)
+    (job,) = read_runs([str(tmp_path / "a")]).jobs
+    heading = "Expected of 90 % of drivers (m/s)"
+    assert heading not in [column.heading for column in errors([job]).columns]
+    add_metric(tmp_path / "a", {"past/bound/policy": 1.357, "past/bound/fixed": 1.592})
+    (job,) = read_runs([str(tmp_path / "a")]).jobs
+    found = {row["Method"]: row[heading] for row in rows_of(errors([job]), job.name)}
+    assert (found["policy"], found["driver-specific"]) == ("1.357", "1.592")
 
 
 @pytest.mark.usefixtures("blank_figures")
