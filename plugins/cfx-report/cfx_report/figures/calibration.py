@@ -190,7 +190,7 @@ def _correlations(axes: Axes, table: pd.DataFrame) -> None:
             value = values[row, column]
             colour = "white" if abs(value) > 0.6 else INK
             axes.text(
-                column, row, f"{value:.1f}", ha="center", va="center", color=colour, size=points(9)
+                column, row, f"{value:z.1f}", ha="center", va="center", color=colour, size=points(9)
             )
     axes.set_title("rank correlation over drivers")
 
