@@ -1,6 +1,6 @@
 """What docs/how-to/uncertainty.md says of `calibration.posterior`: coverage, ranks, I-80, time.
 
-python -m tests.benchmarks.posteriors coverage|recording|forecasts krauss|idm|w99
+python -m tests.benchmarks.posteriors coverage|recording|forecasts|chains krauss|idm|w99
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import Literal
 
+import emcee
 import numpy as np
 import torch
 from scipy.stats import chisquare
@@ -43,6 +44,7 @@ CLASSES = 10
 
 MODELS: dict[str, DrivingModel] = {"krauss": Krauss(), "idm": IDM(), "w99": W99()}
 DRIVERS = {"krauss": 1000, "idm": 300, "w99": 100}
+WALKERS, CHAIN = 40, 4000
 FRAMES, AFTER_S = 600, (1, 5, 10, 30)
 AHEAD_S = (1, 2, 3, 5, 10)
 AFTER = ", ".join(map(str, AFTER_S))
@@ -146,6 +148,51 @@ def recording(name: str) -> Iterator[str]:
         )
 
 
+def chains(name: str) -> Iterator[str]:
+    """Yields how far intervals of ten I-80 drivers are from those of long chains, and the time.
+
+    The chains are emcee's (affine-invariant ensembles, Goodman and Weare 2010), a driver at a time.
+    """
+    model = MODELS[name]
+    pairs = TidyDataset(path=I80, min_frames=700, max_pairs=10).load()
+    batch = PairBatch.of(pairs, dtype=torch.float64)
+    solver = Solver(MemoryStepper(model, batch.dt), RandomSearch(), seed=0)
+    settings = CalibrationSettings(posterior="laplace")
+    posterior = posterior_of(solver, batch, batch.lengths - 1, settings)
+    n, d = len(posterior.space), posterior.dimensions
+    started = time.process_time()
+    normal = laplace(posterior, likely_starts(posterior, seed=0))
+    found = sample(posterior, normal, SHARES, seed=0, memory=1 << 30)
+    ours = time.process_time() - started
+    draw = np.random.default_rng(0)
+    apart, effective, theirs = [], [], 0.0
+    for driver in range(len(batch)):
+        one = posterior.take(torch.tensor([driver]))
+
+        def density(place: np.ndarray, one: Posterior = one) -> np.ndarray:
+            return np.nan_to_num(one(torch.from_numpy(place)[None])[0].numpy(), nan=-np.inf)
+
+        start = normal.mode[driver].numpy() + 0.1 * draw.standard_normal((WALKERS, d))
+        started = time.process_time()
+        sampler = emcee.EnsembleSampler(WALKERS, d, density, vectorize=True)
+        sampler.random_state = np.random.RandomState(driver).get_state()
+        sampler.run_mcmc(start, CHAIN)
+        theirs += time.process_time() - started
+        values = sampler.get_chain(discard=CHAIN // 4, flat=True)[:, :n]
+        slowest = float(np.max(sampler.get_autocorr_time(discard=CHAIN // 4, quiet=True)[:n]))
+        effective.append(len(values) / slowest)
+        ends = np.quantile(values, SHARES[[0, 9, 18]], axis=0)
+        off = found.quantiles[driver, [0, 9, 18]].numpy() - ends
+        apart.append(np.abs(off) / values.std(axis=0))
+    mean, worst = np.mean(apart), np.max(apart)
+    yield (
+        f"{type(model).__name__}: 5, 50 and 95 % of {len(batch)} drivers' {n} parameters are"
+        f" {mean:.2f} deviations apart in the mean, {worst:.2f} at most; effective samples:"
+        f" {float(found.effective.median()):.0f} in {ours:.1f} CPU s for all drivers, emcee"
+        f" {np.median(effective):.0f} in {theirs:.1f} CPU s, a driver at a time"
+    )
+
+
 def forecasts(name: str) -> Iterator[str]:
     """Yields scores of forecasts of speed from each second of the last fifth of I-80's pairs.
 
@@ -213,6 +260,11 @@ def forecast_scores(
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    programs = {"coverage": coverage, "recording": recording, "forecasts": forecasts}
+    programs = {
+        "coverage": coverage,
+        "recording": recording,
+        "forecasts": forecasts,
+        "chains": chains,
+    }
     for line in programs[sys.argv[1]](sys.argv[2]):
         print(line, flush=True)
