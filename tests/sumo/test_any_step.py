@@ -84,6 +84,28 @@ def test_trajectories_are_those_at_the_policys_own_step(
         )
 
 
+def test_in_a_long_step_a_leader_that_it_drives_is_where_its_own_steps_lead() -> None:
+    """So vehicles in a row drive as at the policy's own step, and none answers what was."""
+
+    def speeds_after(dt: float, seconds: float) -> list[float]:
+        lead = Car(speed=10.0)
+        first = Car(speed=12.0, gap=20.0, leader="lead")
+        second = Car(speed=12.0, gap=25.0, leader="first")
+        road = Road(dt=dt, lead=lead, free=Car(), second=second, first=first)
+        driver = Driver(adaptive({"name": "idm"}), speed_mode=0)
+        for _ in range(round(seconds / dt)):
+            driver.step(road, ["free", "second", "first"])
+            for car in (first, second):
+                car.acceleration, car.speed = (car.told[-1] - car.speed) / dt, car.told[-1]
+            first.gap += (lead.speed - first.speed) * dt
+            second.gap += (first.speed - second.speed) * dt
+            road.advance()
+        return [first.speed, second.speed]
+
+    assert speeds_after(0.5, 0.5) == pytest.approx(speeds_after(0.1, 0.5), abs=1e-9)
+    assert min(speeds_after(0.1, 0.5)) > 8.0, "limits of braking would make all alike"
+
+
 def test_acceleration_is_held_between_the_models_steps() -> None:
     told = driven(0.02).road.cars["car"].told
     first = torch.tensor(told[:50]).diff().reshape(-1)

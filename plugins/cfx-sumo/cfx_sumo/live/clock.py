@@ -1,8 +1,9 @@
 """How the time step of a policy fits into that of a simulation.
 
 A policy has learned to choose at one time step, and its model to take steps of it. In a simulation
-with longer steps the model takes several in each, behind a leader that goes on as it accelerates.
-In one with shorter steps it takes one in several of them, and its acceleration is held meanwhile.
+with longer steps the model takes several in each: leaders that it drives too take theirs at the
+same time, others go on as they accelerate. In one with shorter steps it takes one in several of
+them, and its acceleration is held meanwhile.
 """
 
 from __future__ import annotations

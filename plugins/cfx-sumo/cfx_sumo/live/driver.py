@@ -152,9 +152,9 @@ class Driver:
     leader from then on.
 
     The simulation may step by 0.01 to 1 s, whatever the policy's time step is. In a longer step the
-    model takes several, behind a leader that goes on as it accelerates; histories are corrected as
-    soon as it is known what the leader did. In shorter steps each acceleration is held until a
-    time step of the policy has passed.
+    model takes several, together with those of the leaders that it drives too; another leader goes
+    on as it accelerates, and histories are corrected as soon as it is known what it did. In shorter
+    steps each acceleration is held until a time step of the policy has passed.
 
     The lane's limit and the vehicle's `maxSpeed` hold as they do around SUMO's own models. With the
     default `speed_mode` 31 SUMO's checks bound each speed: red lights, stops, who yields at
@@ -507,7 +507,7 @@ class Driver:
             limited = _is_limited(self.model, seen.speed[:count], speed[:count], clock.step)
             self.counts.limited += int(limited.sum())
             hardest = torch.maximum(hardest, bound)
-            seen = seen.one_step_later(speed, clock.step)
+            seen = seen.one_step_later(speed, clock.step, view.rows)
         self.counts.free += clock.substeps * len(view.alone)
         store.expected[slots] = _frame(seen)
         store.start[slots], store.ramp[slots] = first, (seen.speed - first) / clock.period

@@ -43,16 +43,20 @@ class Seen(NamedTuple):
         """Returns some of the vehicles."""
         return Seen(*(signal[index] for signal in self))
 
-    def one_step_later(self, speed: Tensor, dt: float) -> Seen:
+    def one_step_later(self, speed: Tensor, dt: float, leaders: Tensor | None = None) -> Seen:
         """Returns what is to be expected one step of a model later.
 
-        Leaders go on as they accelerate, and brake to a standstill at most.
+        Leaders that are among the vehicles have their speeds. Others go on as they accelerate, and
+        brake to a standstill at most.
 
         Args:
             speed: of the followers then, `(D,)`, m/s.
             dt: the step, s.
+            leaders: as in `View`; None: no leader is among the vehicles.
         """
         leader_speed = (self.leader_speed + self.leader_acceleration * dt).clamp(min=0.0)
+        if leaders is not None:
+            leader_speed = torch.where(leaders < 0, leader_speed, speed[leaders])
         return self._replace(
             speed=speed,
             acceleration=(speed - self.speed) / dt,
@@ -84,14 +88,16 @@ class View(NamedTuple):
         following: vehicles with a leader, F of them.
         leaders: their leaders.
         alone: vehicles without a leader.
-        seen: what all of them do, those with a leader first. The others have a leader that is as
-            fast as they are, a thousand kilometres ahead.
+        seen: what all D do, those with a leader first. The others have a leader that is as fast as
+            they are, a thousand kilometres ahead.
+        rows: of the leaders among the D vehicles, `(D,)` int64; below 0: another vehicle, or none.
     """
 
     following: list[str]
     leaders: list[str]
     alone: list[str]
     seen: Seen
+    rows: Tensor
 
 
 def look(connection: Connection, names: list[str], look_ahead: float) -> View:
@@ -199,7 +205,10 @@ def _view(
     count = int(follows.sum())
     placed = [names[row] for row in order.tolist()]
     leaders = [ahead[row] for row in order[:count].tolist()]
-    return View(placed[:count], leaders, placed[count:], seen)
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    among = np.where(follows & (rows >= 0), place.take(rows, mode="clip"), _ANOTHER)[order]
+    return View(placed[:count], leaders, placed[count:], seen, torch.from_numpy(among))
 
 
 def _culprit(reader: DirectReader | SubscribedReader, names: list[str]) -> str:
