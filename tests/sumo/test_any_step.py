@@ -13,6 +13,7 @@ from cfx.core.errors import SumoError
 from cfx.policies.features import History
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.driver import Driver
+from cfx_sumo.live.fleet import Fleet
 from tests.agents import adaptive
 from tests.sumo.test_driver import Car, Road
 
@@ -84,17 +85,20 @@ def test_trajectories_are_those_at_the_policys_own_step(
         )
 
 
-def test_in_a_long_step_a_leader_that_it_drives_is_where_its_own_steps_lead() -> None:
+@pytest.mark.parametrize("drivers", [1, 2])
+def test_in_a_long_step_a_leader_that_is_driven_is_where_its_own_steps_lead(drivers: int) -> None:
     """So vehicles in a row drive as at the policy's own step, and none answers what was."""
 
     def speeds_after(dt: float, seconds: float) -> list[float]:
-        lead = Car(speed=10.0)
+        lead = Car(speed=10.0, kind="other")
         first = Car(speed=12.0, gap=20.0, leader="lead")
         second = Car(speed=12.0, gap=25.0, leader="first")
         road = Road(dt=dt, lead=lead, free=Car(), second=second, first=first)
-        driver = Driver(adaptive({"name": "idm"}), speed_mode=0)
+        made = [Driver(adaptive({"name": "idm"}), speed_mode=0) for _ in range(drivers)]
+        fleet = Fleet({"calm": made[0], "hasty": made[-1]})
+        first.kind = "hasty"
         for _ in range(round(seconds / dt)):
-            driver.step(road, ["free", "second", "first"])
+            fleet.step(road)
             for car in (first, second):
                 car.acceleration, car.speed = (car.told[-1] - car.speed) / dt, car.told[-1]
             first.gap += (lead.speed - first.speed) * dt

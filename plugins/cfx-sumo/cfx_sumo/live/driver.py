@@ -13,7 +13,7 @@ Shapes: D vehicles, n tuned parameters, L frames of a token.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TypedDict, Unpack, cast
@@ -60,6 +60,10 @@ caches, and takes twice as long for each."""
 
 _OBEYED_MPS = 1e-3
 """A speed this close to what SUMO was told is what it was told."""
+
+Together = dict[tuple[int, int], dict[str, float]]
+"""Speeds of vehicles, m/s, that drivers of one simulation expect within a step of it: by how many
+steps their models take in it, and which of these it is."""
 
 _WALKING_MPS = 1.5
 """Speed below which a time gap means nothing."""
@@ -436,6 +440,28 @@ class Driver:
             SumoError: a vehicle is not in the simulation or acts less often than it steps, the
                 simulation steps by less than 0.01 s or more than 1 s, or integrates ballistically.
         """
+        for _ in self.in_turns(connection, vehicles, drive=drive):
+            pass
+
+    def in_turns(
+        self,
+        connection: Connection,
+        vehicles: str | Iterable[str],
+        together: Together | None = None,
+        *,
+        drive: bool = True,
+    ) -> Iterator[None]:
+        """Does what `step` does, and stops where other drivers of the simulation take their turn.
+
+        That is after each step of the model in a longer one of the simulation.
+
+        Args:
+            connection, vehicles, drive: as for `step`.
+            together: what all drivers of the simulation expect, where this is not the only one.
+
+        Raises:
+            SumoError: as `step`.
+        """
         names = [vehicles] if isinstance(vehicles, str) else list(vehicles)
         now = connection.simulation.getTime()
         clock = self._clock_of(connection)
@@ -448,7 +474,7 @@ class Driver:
         view = look(connection, due, self.look_ahead)
         if drive:
             self._hold(connection, between, now, clock)
-            self._drive(connection, view, now, clock)
+            yield from self._drive(connection, view, now, clock, together)
         else:
             self._watch(connection, view, now, clock)
 
@@ -482,7 +508,14 @@ class Driver:
         store.told[slots] = store.start[slots] + store.ramp[slots] * passed
         set_speeds(connection, driven, store.told[slots].tolist())
 
-    def _drive(self, connection: Connection, view: View, now: float, clock: Clock) -> None:
+    def _drive(
+        self,
+        connection: Connection,
+        view: View,
+        now: float,
+        clock: Clock,
+        together: Together | None,
+    ) -> Iterator[None]:
         """Lets the model take its steps until the next look, and tells SUMO where they lead."""
         names = [*view.following, *view.alone]
         if not names:
@@ -507,7 +540,15 @@ class Driver:
             limited = _is_limited(self.model, seen.speed[:count], speed[:count], clock.step)
             self.counts.limited += int(limited.sum())
             hardest = torch.maximum(hardest, bound)
-            seen = seen.one_step_later(speed, clock.step, view.rows)
+            leaders = None
+            if clock.substeps > 1:
+                others: dict[str, float] = {}
+                if together is not None:
+                    others = together.setdefault((clock.substeps, number), {})
+                    others.update(zip(names, speed.tolist(), strict=True))
+                    yield
+                leaders = view.leader_speeds(speed, others)
+            seen = seen.one_step_later(speed, clock.step, leaders)
         self.counts.free += clock.substeps * len(view.alone)
         store.expected[slots] = _frame(seen)
         store.start[slots], store.ramp[slots] = first, (seen.speed - first) / clock.period

@@ -6,11 +6,16 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Unpack
 
+import torch
+
 from cfx.core.errors import DataError
+from cfx.core.threads import one_thread
 from cfx.policies.placement import ALL
-from cfx_sumo.live.driver import Driver, DriverOptions
+from cfx_sumo.live.driver import Driver, DriverOptions, Together
 from cfx_sumo.live.saved import read_state, write_state
 from cfx_sumo.live.surroundings import Connection
+
+_DONE = object()
 
 
 class Fleet:
@@ -75,6 +80,8 @@ class Fleet:
         """The vType of each vehicle of the fleet that was on the road at the last step."""
         return {vehicle: name for vehicle, name in self._type_of.items() if name in self.drivers}
 
+    @torch.no_grad()
+    @one_thread()
     def step(self, connection: Connection) -> None:
         """Sets the speeds of the fleet's vehicles in the next `simulationStep`.
 
@@ -96,8 +103,13 @@ class Fleet:
         for vehicle, name in types.items():
             if name in self.drivers:
                 vehicles[id(self.drivers[name])].append(vehicle)
-        for driver in self._each_driver():
-            driver.step(connection, vehicles[id(driver)])
+        together: Together | None = {} if len(vehicles) > 1 else None
+        turns = [
+            driver.in_turns(connection, vehicles[id(driver)], together)
+            for driver in self._each_driver()
+        ]
+        while turns:
+            turns = [turn for turn in turns if next(turn, _DONE) is not _DONE]
 
     def save_state(self, path: str | Path) -> None:
         """Writes what all drivers know, as `Driver.save_state` does.

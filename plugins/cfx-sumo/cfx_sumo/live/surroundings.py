@@ -46,17 +46,18 @@ class Seen(NamedTuple):
     def one_step_later(self, speed: Tensor, dt: float, leaders: Tensor | None = None) -> Seen:
         """Returns what is to be expected one step of a model later.
 
-        Leaders that are among the vehicles have their speeds. Others go on as they accelerate, and
-        brake to a standstill at most.
+        Leaders of whom nothing is known go on as they accelerate, and brake to a standstill at
+        most.
 
         Args:
             speed: of the followers then, `(D,)`, m/s.
             dt: the step, s.
-            leaders: as in `View`; None: no leader is among the vehicles.
+            leaders: speed of their leaders then, `(D,)`, m/s; NaN where it is not known; None: it
+                is known of none.
         """
         leader_speed = (self.leader_speed + self.leader_acceleration * dt).clamp(min=0.0)
         if leaders is not None:
-            leader_speed = torch.where(leaders < 0, leader_speed, speed[leaders])
+            leader_speed = torch.where(leaders.isnan(), leader_speed, leaders)
         return self._replace(
             speed=speed,
             acceleration=(speed - self.speed) / dt,
@@ -98,6 +99,19 @@ class View(NamedTuple):
     alone: list[str]
     seen: Seen
     rows: Tensor
+
+    def leader_speeds(self, speed: Tensor, others: Mapping[str, float]) -> Tensor:
+        """Returns the speeds of leaders that are driven too, `(D,)`, m/s; NaN of other leaders.
+
+        Args:
+            speed: of the D vehicles, `(D,)`, m/s.
+            others: of vehicles that other drivers drive, by their ids.
+        """
+        known = torch.where(self.rows < 0, torch.nan, speed[self.rows])
+        if others:
+            for row in (self.rows[: len(self.leaders)] < 0).nonzero().flatten().tolist():
+                known[row] = others.get(self.leaders[row], torch.nan)
+        return known
 
 
 def look(connection: Connection, names: list[str], look_ahead: float) -> View:
