@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from pathlib import Path
+from typing import Any
 
 import pandas as pd
 import pytest
@@ -24,27 +26,31 @@ NAMES = sorted(FILES)
 SMALL = ["optimizer=random", "optimizer.samples=32", "figures.enabled=false", "learner.epochs=2"]
 
 
+@functools.cache
+def composed(*overrides: str) -> dict[str, Any]:
+    """Returns a job's configuration; several tests look at the same one."""
+    return hydra_source.plain(hydra_source.composed(overrides))
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_every_experiment_says_its_question_command_and_duration(name: str) -> None:
     text = FILES[name].read_text(encoding="utf-8")
     assert text.startswith("# @package _global_\n# Question: ")
     assert f"\n# Command:  python -m cfx experiment={name} " in text
     assert "\n# Duration: " in text
-    assert hydra_source.plain(hydra_source.composed([f"experiment={name}"]))["preset"] == name
+    assert composed(f"experiment={name}")["preset"] == name
 
 
 @pytest.mark.parametrize("name", [name for name in NAMES if not name.startswith("paper/")])
 def test_baselines_are_calibrated_as_a_calibration_is(name: str) -> None:
-    chosen = hydra_source.plain(hydra_source.composed([f"experiment={name}"]))["optimizer"]
-    assert chosen == hydra_source.plain(hydra_source.composed([]))["optimizer"]
+    chosen = composed(f"experiment={name}")["optimizer"]
+    assert chosen == composed()["optimizer"]
 
 
 @pytest.mark.parametrize("name", ["paper/pair", "paper/pairs", "paper/clusters", "paper/grid"])
 def test_the_papers_experiments_train_as_the_paper_does(name: str) -> None:
-    values = hydra_source.plain(
-        hydra_source.composed([f"experiment={name}", "data=tidy", "data.path=pairs.csv"])
-    )
-    own = hydra_source.plain(hydra_source.composed(["experiment=paper/imitation"]))
+    values = composed(f"experiment={name}", "data=tidy", "data.path=pairs.csv")
+    own = composed("experiment=paper/imitation")
     assert (values["learner"], values["policy"], values["windows"]) == (
         own["learner"],
         own["policy"],

@@ -275,34 +275,16 @@ def test_a_job_gives_the_same_numbers_whatever_its_caller_has_chosen(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    alone = cfx.run([*QUICK, "cache.enabled=false"]).metrics
+    quick = [*QUICK, "data.max_pairs=2", "cache.enabled=false", "tracking.enabled=false"]
+    alone = cfx.run(quick).metrics
     with _a_program(tmp_path):
-        in_program = cfx.run([*QUICK, "cache.enabled=false"]).metrics
+        in_program = cfx.run(quick).metrics
     assert in_program == pytest.approx(alone, rel=0, abs=0, nan_ok=True)
 
 
-APPLICATION = """
-import hydra
-from hydra.core.global_hydra import GlobalHydra
-from hydra.core.hydra_config import HydraConfig
-import cfx
-
-@hydra.main(version_base=None)
-def main(config):
-    mine = HydraConfig.get()
-    running = GlobalHydra.instance().hydra
-    cfx.run(["debug=quick", "data.max_pairs=3", "policy=default", "figures.enabled=false"])
-    assert HydraConfig.get() is mine
-    assert GlobalHydra.instance().hydra is running
-    print("went on")
-
-main()
-"""
-
-
-def _program(text: str, folder: Path) -> str:
+def _program(arguments: list[str], folder: Path) -> str:
     done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(text)],
+        [sys.executable, *arguments],
         cwd=folder,
         capture_output=True,
         text=True,
@@ -313,22 +295,13 @@ def _program(text: str, folder: Path) -> str:
     return done.stdout
 
 
-def test_a_job_runs_within_somebody_elses_hydra_application(tmp_path: Path) -> None:
-    (tmp_path / "main.py").write_text(APPLICATION, encoding="utf-8")
-    done = subprocess.run(
-        [sys.executable, "main.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "went on" in done.stdout
-
-
-AUTOLOGGING = """
+APPLICATION = """
+import hydra
 import mlflow
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from mlflow.utils import autologging_utils
+
 mlflow.set_tracking_uri("sqlite:///callers.db")
 mlflow.set_experiment("callers")
 mlflow.autolog()
@@ -340,33 +313,40 @@ QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures.enabled
 def fails(*_):
     raise SystemError
 
-try:
-    cfx.run(QUICK, run_job=fails)
-except SystemError:
-    pass
-assert mlflow.active_run() is None
+@hydra.main(version_base=None)
+def main(config):
+    hydras = HydraConfig.get(), GlobalHydra.instance().hydra
+    try:
+        cfx.run(QUICK, run_job=fails)
+    except SystemError:
+        pass
+    assert mlflow.active_run() is None
+    assert not autologging_utils.autologging_is_disabled("pytorch")
+    assert not autologging_utils._AUTOLOGGING_GLOBALLY_DISABLED
+    with mlflow.start_run() as mine:
+        cfx.run(QUICK)
+        assert mlflow.active_run().info.run_id == mine.info.run_id
+    assert HydraConfig.get() is hydras[0]
+    assert GlobalHydra.instance().hydra is hydras[1]
+    assert mlflow.get_run(mine.info.run_id).data.metrics == {}
+    runs = mlflow.search_runs(experiment_names=["callers"])
+    assert len(runs) == 1, runs.to_string()
+    print("went on")
 
-from mlflow.utils.autologging_utils import autologging_is_disabled
-from mlflow.utils import autologging_utils
-assert not autologging_is_disabled("pytorch")
-assert not autologging_utils._AUTOLOGGING_GLOBALLY_DISABLED
-
-with mlflow.start_run() as mine:
-    cfx.run(QUICK)
-    assert mlflow.active_run().info.run_id == mine.info.run_id
-assert mlflow.get_run(mine.info.run_id).data.metrics == {}
-runs = mlflow.search_runs(experiment_names=["callers"])
-assert len(runs) == 1, runs.to_string()
+main()
 """
 
 
-def test_autologging_makes_no_run_of_a_job_and_goes_on_afterwards(tmp_path: Path) -> None:
-    _program(AUTOLOGGING, tmp_path)
+def test_a_job_runs_within_somebody_elses_hydra_application_that_logs_by_itself(
+    tmp_path: Path,
+) -> None:
+    """Autologging makes no run of a job, and goes on afterwards; the application is Hydra's own."""
+    (tmp_path / "main.py").write_text(APPLICATION, encoding="utf-8")
+    assert "went on" in _program(["main.py"], tmp_path)
 
 
 def test_importing_cfx_changes_nothing(tmp_path: Path) -> None:
-    _program(
-        """
+    script = """
         import logging, os, signal, warnings
         def state():
             signals = [signal.getsignal(number) for number in signal.valid_signals()]
@@ -374,6 +354,5 @@ def test_importing_cfx_changes_nothing(tmp_path: Path) -> None:
         before = state()
         import cfx
         assert state() == before
-        """,
-        tmp_path,
-    )
+    """
+    _program(["-c", textwrap.dedent(script)], tmp_path)

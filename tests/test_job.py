@@ -289,7 +289,8 @@ def test_the_raw_sample_is_found(shared_data: Path) -> None:
             f"data.path={path}",
             "data.min_frames=300",
             "optimizer=random",
-            "optimizer.samples=16",
+            "optimizer.samples=4",
+            "calibration.prior=none",
             "policy=fixed",
         ]
     )
@@ -400,9 +401,9 @@ def test_a_wrong_separator_is_told(tidy: Path, capsys: pytest.CaptureFixture[str
         (["windows.length=2"], "windows"),
         (["policy.inputs=[leader_sped]"], "leader_speed"),
         (["learner.epochs=fast"], "learner.epochs"),
-        (["data.max_pairs=50"], "50"),
-        (["data.frames=9"], "min_frames"),
-        (["data.min_frames=5000"], "5000"),
+        (["data.pairs=6", "data.max_pairs=50"], "50"),
+        (["data.pairs=6", "data.frames=9"], "min_frames"),
+        (["data.pairs=6", "data.min_frames=5000"], "5000"),
         (["style.cluster=agressive"], "aggressive"),
         (["device=cuda:99"], "device"),
     ],

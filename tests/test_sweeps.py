@@ -20,7 +20,7 @@ import pytest
 from filelock import FileLock
 from hydra.core.plugins import Plugins
 
-from cfx.app import application, sweep
+from cfx.app import application, hydra_source, sweep
 from cfx.app.sweep import SweepFolder
 from cfx.results import provenance
 
@@ -200,19 +200,10 @@ def test_a_folder_that_was_asked_for_is_continued_even_if_complete(
     assert told == {"my sweep"}  # one name in MLflow, however the folder was written
 
 
-def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    Path("drives.csv").write_text("a")
-    monkeypatch.setenv("CFX_FRAMES", "100")
-    command = [
-        "-m",
-        "seed=0",
-        "data=tidy",
-        "data.path=drives.csv",
-        "data.min_frames=${oc.env:CFX_FRAMES}",
-        "hydra.sweep.dir=s",
-    ]
+def test_a_job_runs_again_if_its_data_changed_or_its_status_is_broken(run: Run) -> None:
+    for name in ("a.csv", "b.csv"):
+        Path(name).write_text("a")
+    command = ["-m", "seed=0", "data=tidy", "data.path=[a.csv,b.csv]", "hydra.sweep.dir=s"]
 
     def runs() -> int:
         assert run(*command) == 0
@@ -220,33 +211,35 @@ def test_a_job_runs_again_if_anything_differs_that_its_results_depend_on(
 
     assert runs() == 1
     assert runs() == 0
-    Path("drives.csv").write_text("ab")
+    Path("b.csv").write_text("ab")
     assert runs() == 1
-    os.utime("drives.csv", ns=(1, 1))
-    assert runs() == 1
-    monkeypatch.setenv("CFX_FRAMES", "200")
-    assert runs() == 1
-    monkeypatch.setattr(provenance, "version", lambda: "99.0")
-    assert runs() == 1
-    monkeypatch.setattr(provenance, "distributions", lambda values: {"cfx-idm": "0.3"})
-    assert runs() == 1
-    assert runs() == 0
     (jobs(Path("s"))[0] / sweep.STATUS).write_text('{"code": 0')
     assert runs() == 1
     assert len(jobs(Path("s"))) == 1
 
 
-@pytest.mark.parametrize("path", ["[a.csv,b.csv]", "*.csv"])
-def test_a_job_runs_again_if_one_of_several_files_changed(run: Run, path: str) -> None:
+def test_its_fingerprint_is_of_all_that_its_results_depend_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
     for name in ("a.csv", "b.csv"):
         Path(name).write_text("a")
-    command = ["-m", "seed=0", "data=tidy", f"data.path={path}", "hydra.sweep.dir=s"]
-    assert run(*command) == 0
-    assert run(*command) == 0
-    assert len(ran()) == 1
+    job = ["data=tidy", "data.path=*.csv", "data.min_frames=${oc.env:CFX_FRAMES}"]
+    found = []
+    for frames in ("100", "200"):
+        monkeypatch.setenv("CFX_FRAMES", frames)
+        values = hydra_source.plain(hydra_source.composed(job))
+        found.append(sweep.fingerprint(values))
+    assert sweep.fingerprint(values) == found[-1]
     Path("b.csv").write_text("ab")
-    assert run(*command) == 0
-    assert len(ran()) == 1
+    found.append(sweep.fingerprint(values))
+    os.utime("a.csv", ns=(1, 1))
+    found.append(sweep.fingerprint(values))
+    monkeypatch.setattr(provenance, "version", lambda: "99.0")
+    found.append(sweep.fingerprint(values))
+    monkeypatch.setattr(provenance, "distributions", lambda values: {"cfx-idm": "0.3"})
+    found.append(sweep.fingerprint(values))
+    assert len(set(found)) == 6
 
 
 def test_a_sweep_that_runs_is_left_alone(run: Run, capsys) -> None:

@@ -322,7 +322,7 @@ with MlflowTracker.run(uri, run_name=f"job {seed}", parameters={"seed": seed}, s
 """
 
 
-def test_many_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
+def test_two_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
     """They make the database, the experiment and one parent between them."""
     uri = f"sqlite:///{tmp_path}/new/deeper/mlflow.db"
     jobs = [
@@ -332,11 +332,11 @@ def test_many_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
             stderr=subprocess.STDOUT,
             text=True,
         )
-        for k in range(3)
+        for k in range(2)
     ]
     said = [job.communicate(timeout=200)[0] for job in jobs]
-    assert [job.returncode for job in jobs] == [0] * 3, said
-    assert said == [""] * 3
+    assert [job.returncode for job in jobs] == [0] * 2, said
+    assert said == [""] * 2
     with quiet():
         from mlflow import MlflowClient
 
@@ -344,10 +344,10 @@ def test_many_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
         runs = client.search_runs([client.get_experiment_by_name("cfx").experiment_id])
     parents = [run for run in runs if "cfx.sweep_parent" in run.data.tags]
     children = [run for run in runs if run.data.tags.get("cfx.sweep") == "a_sweep_of/many"]
-    assert (len(parents), len(children), len(runs)) == (1, 3, 4)
+    assert (len(parents), len(children), len(runs)) == (1, 2, 3)
     assert {run.info.status for run in runs} == {"FINISHED"}
     assert {run.data.tags["mlflow.parentRunId"] for run in children} == {parents[0].info.run_id}
-    assert {run.data.params["seed"] for run in children} == set("012")
+    assert {run.data.params["seed"] for run in children} == set("01")
 
 
 def test_a_sweep_has_the_status_of_its_jobs(uri: str, client: Any) -> None:
