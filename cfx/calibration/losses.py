@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -266,8 +267,9 @@ class PooledLosses:
     """The mean loss over many segments, for one parameter set that is shared by all of them.
 
     The mean of losses, not the loss over all frames: every driver counts alike, and the mean is
-    what an evaluation reports. Where all problems ask for the same candidates, as space-filling
-    ones are, a segment that belongs to several problems is simulated once.
+    what an evaluation reports. A segment that belongs to several problems is simulated once, for
+    the candidates of all of them, or once for all where these are the same, as space-filling ones
+    are.
 
     Attributes:
         segments: D segments.
@@ -322,28 +324,72 @@ class PooledLosses:
         segments = replace(self.segments, simulator=simulator)
         total = candidates.new_zeros(candidates.shape[:2])
         for some in torch.split(used, _SEGMENTS_AT_ONCE):
-            problem, place = self.members[:, some].nonzero().unbind(1)
+            members = self.members[:, some]
+            problem, place = members.nonzero().unbind(1)
             if shared:
-                own, asked = segments.take(some), candidates[:1].expand(len(some), -1, -1)
-            else:
-                own, asked = segments.take(some[place]), candidates[problem]
-                place = torch.arange(len(place), device=place.device)
-            for columns, block in self._blocks(own, total, asked):
-                columns.index_add_(0, problem, own(block).to(total)[place])
+                own = segments.take(some)
+                for columns, block in self._blocks(own, len(some), total, candidates[:1]):
+                    found = own(block.expand(len(some), -1, -1)).to(total)
+                    columns.index_add_(0, problem, found[place])
+                continue
+            groups = _by_problems(members)
+            taken = [segments.take(some[group.places]) for group in groups]
+            for columns, block in self._blocks(taken[0], len(place), total, candidates):
+                width = block.shape[1]
+                found = columns.new_empty((len(place), width))
+                for own, group in zip(taken, groups, strict=True):
+                    losses = own(block[group.problems].flatten(1, 2))
+                    found[group.members] = losses.to(total).reshape(*group.problems.shape, width)
+                columns.index_add_(0, problem, found)
         losses = total / self.members.sum(1, keepdim=True)
         if self.prior is None:
             return losses
         return losses + self.prior.penalty(candidates)
 
     def _blocks(
-        self, segments: SegmentLosses, total: Tensor, candidates: Tensor
+        self, segments: SegmentLosses, simulated: int, total: Tensor, candidates: Tensor
     ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Yields columns of `total` `(K, q)` with the candidates `(S, q, n)` that belong there."""
+        """Yields columns of `total` `(K, q)` with their candidates, of `(K, q, n)` or `(1, q, n)`.
+
+        Args:
+            segments: some of those that are simulated.
+            simulated: how many are simulated for one candidate of each problem.
+            total, candidates: what is cut.
+        """
         bound = min(self.memory, _BYTES_AT_ONCE)
         if segments.accumulates:
             bound = min(self.memory, _SUMMED_AT_ONCE)
-        block = max(1, bound // (segments.bytes_per_candidate * segments.problems))
+        block = max(1, bound // (segments.bytes_per_candidate * simulated))
         if block > _VECTOR:
             block -= block % _VECTOR
         columns = torch.split(total, block, dim=1)
         yield from zip(columns, torch.split(candidates, block, dim=1), strict=True)
+
+
+class _Group(NamedTuple):
+    """Segments that belong to equally many problems, m.
+
+    Each is simulated once, for the candidates of all its problems: it is read once, and the kernel
+    fills its vectors although each problem may ask for few candidates.
+
+    Attributes:
+        places: `(G,)`, of the segments.
+        problems: `(G, m)`, those that each belongs to.
+        members: `(G, m)`, which number these have among all memberships, problem by problem.
+    """
+
+    places: Tensor
+    problems: Tensor
+    members: Tensor
+
+
+def _by_problems(members: Tensor) -> list[_Group]:
+    """Groups segments by the number of their problems, of memberships bool `(K, S)`."""
+    number = members.flatten().cumsum(0).reshape(members.shape) - 1
+    counts = members.sum(0)
+    groups = []
+    for count in sorted(set(counts.tolist())):
+        places = (counts == count).nonzero()[:, 0]
+        problems = members[:, places].T.nonzero()[:, 1].reshape(len(places), count)
+        groups.append(_Group(places, problems, number[problems, places[:, None]]))
+    return groups
