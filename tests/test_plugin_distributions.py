@@ -60,7 +60,6 @@ RESULTS = {
     "cfx.evaluation.tables",
     "cfx.learners.curves",
     "cfx.results.provenance",
-    "cfx.results.store",
     "cfx.results.tracker",
 }
 PROTOCOLS = {

@@ -13,7 +13,7 @@ from cfx.app.job.run import compute
 from cfx.app.overrides import command_of, config_of
 from cfx.core.guest import visit
 from cfx.results.config import JobConfig
-from cfx.results.store import folder_of
+from cfx.results.tracker import folder_of
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from cfx.app.overrides import IN_MEMORY
 from cfx.core.errors import ConfigError
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
-from cfx.results.store import folder_of
+from cfx.results.tracker import folder_of
 
 PolicyLike = JobResult | Agent | str | Path
 """A policy: a result that has one, the policy itself, a job's folder, or `cfx://NAME`."""

@@ -129,6 +129,7 @@ PARTS: dict[str, Kind] = {
             group="calibration.posterior",
             chosen=False,
         ),
+        Kind("tracker", "cfx.results.tracker:Tracking", group="tracking.name", chosen=False),
     )
 }
 """Kinds of classes that come in the same way, are no components to configure, and have no suite.

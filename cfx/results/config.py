@@ -71,9 +71,10 @@ class OutputSettings(Settings):
 
 
 class TrackingSettings(Settings):
-    """What MLflow keeps."""
+    """Where a job is tracked."""
 
-    enabled: bool = Field(True, description="log the job to MLflow")
+    enabled: bool = Field(True, description="log the job")
+    name: str = Field("mlflow", description="where: mlflow (cfx-mlflow), or a plugin's")
     uri: str | None = Field(
         None,
         description="this job's tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the"
@@ -150,7 +151,7 @@ class JobConfig(Settings):
     style: StyleSettings = Field(StyleSettings(), description="driving style")
     cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
     output: OutputSettings = Field(OutputSettings(), description="where results go")
-    tracking: TrackingSettings = Field(TrackingSettings(), description="MLflow")
+    tracking: TrackingSettings = Field(TrackingSettings(), description="where jobs are tracked")
     failed_value: Annotated[float, Field(ge=float("-inf"), allow_inf_nan=True)] | None = Field(
         None,
         description="what a sweeper that optimises is told if this job fails, such as inf; null:"

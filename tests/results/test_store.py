@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from cfx.core.errors import TrackingError
-from cfx.results import store
-from cfx.results.store import open_store, tracking_uri
+from cfx_mlflow import store
+from cfx_mlflow.store import open_store, tracking_uri
 
 
 @pytest.fixture(autouse=True)

@@ -33,11 +33,12 @@ from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.direct import DirectHead
 from cfx.results import provenance
 from cfx.results.config import JobConfig
-from cfx.results.store import download_run, quiet, translate_errors
 from cfx.results.table import Findings, Kept, ResultTable, WrittenTable
 from cfx.results.tables import Pairs
-from cfx.results.tracker import CURVE_POINTS, MlflowTracker, Tracker, sweep_link
+from cfx.results.tracker import tracked
 from cfx.simulation.windows import WindowSettings
+from cfx_mlflow.store import download_run, quiet, translate_errors
+from cfx_mlflow.tracker import CURVE_POINTS, MlflowTracker, sweep_link
 from tests.drives import wavy_pairs
 from tests.made_up import MadeUp, make_curves, make_results
 
@@ -94,7 +95,11 @@ def begin(uri: str, **changes: Any) -> Any:
 
 
 def log_job(
-    run: Tracker, made: MadeUp, saved: SimpleNamespace, *files: Path, figures: Sequence[Path] = ()
+    run: MlflowTracker,
+    made: MadeUp,
+    saved: SimpleNamespace,
+    *files: Path,
+    figures: Sequence[Path] = (),
 ) -> None:
     """Logs made-up results, with a policy that is not theirs."""
     result = ProtocolResult(made.evaluation, saved.policy, made.curves, None)
@@ -135,7 +140,7 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
     results = make_results(pairs=4, frames=20)
     (tmp_path / "metrics.json").write_text("{}")
     (tmp_path / "drives.png").write_bytes(b"png")
-    with Tracker.open(config_of(uri), tmp_path / "job") as run:
+    with tracked(config_of(uri), tmp_path / "job") as run:
         assert client.get_run(run.run_id).info.status == "RUNNING"
         run.set_tags({"dataset.fingerprint": "f" * 64})
         log_job(
@@ -191,7 +196,7 @@ def test_undefined_metrics_are_kept_as_such(uri: str, client: Any) -> None:
 def test_a_store_is_made_beside_the_outputs(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with Tracker.open(config_of(None), tmp_path / "job") as run:
+    with tracked(config_of(None), tmp_path / "job") as run:
         run.set_tags({"x": "y"})
     assert (tmp_path / "outputs" / "mlflow.db").is_file()
     assert (tmp_path / "outputs" / "mlartifacts" / run.run_id).is_dir()
@@ -207,7 +212,7 @@ def test_a_store_is_made_beside_the_outputs(
 
 def test_tracking_can_be_off(tmp_path: Path, saved_policy: SimpleNamespace) -> None:
     before = names_in(tmp_path)
-    with Tracker.open(config_of("nonsense", enabled=False), tmp_path) as run:
+    with tracked(config_of("nonsense", enabled=False), tmp_path) as run:
         run.set_tags({"a": "b"})
         log_job(run, make_results(pairs=1, frames=10), saved_policy)
     assert (run.run_id, run.how_to_open()) == ("", ())
@@ -314,7 +319,7 @@ def test_a_run_whose_process_is_gone_is_closed(uri: str, client: Any) -> None:
 
 JOB = """
 import sys
-from cfx.results.tracker import MlflowTracker
+from cfx_mlflow.tracker import MlflowTracker
 uri, seed = sys.argv[1:]
 sweep = "a sweep'of/many"
 with MlflowTracker.run(uri, run_name=f"job {seed}", parameters={"seed": seed}, sweep=sweep) as run:
@@ -542,16 +547,18 @@ def test_artifacts_that_cannot_be_written_are_found_at_the_start(
 def test_plugins_are_named_with_their_versions(
     uri: str, client: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    from cfx.core import registry
+    real = registry.entry
 
-    def entry(kind: str, name: str) -> SimpleNamespace:
+    def entry(kind: str, name: str) -> Any:
+        if kind == "tracker":
+            return real(kind, name)
         plugin = kind == "model"
         return SimpleNamespace(
             distribution="cfx-idm" if plugin else "cfx-driving", version="0.3" if plugin else "0.1"
         )
 
     monkeypatch.setattr(registry, "entry", entry)
-    with Tracker.open(config_of(uri), tmp_path) as run:
+    with tracked(config_of(uri), tmp_path) as run:
         pass
     tags = client.get_run(run.run_id).data.tags
     assert (tags["cfx.plugins"], tags["cfx.plugin.cfx-idm"]) == ("cfx-idm 0.3", "0.3")

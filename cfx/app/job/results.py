@@ -22,8 +22,8 @@ from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
-from cfx.results.store import folder_of
 from cfx.results.table import Findings, read_tables
+from cfx.results.tracker import folder_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

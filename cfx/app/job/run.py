@@ -43,14 +43,14 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     from cfx.app.job.console import described, report, report_places
     from cfx.app.job.output import Upload
     from cfx.app.job.results import Computed, JobResult
-    from cfx.results.tracker import Tracker
+    from cfx.results.tracker import tracked
 
     data = config.data
     console = console or Console()
     config, parts = steps.prepare(config)
     output.begin(folder, config)
     upload = Upload.of(config.output.url, folder)
-    with Tracker.open(config, folder) as tracker:
+    with tracked(config, folder) as tracker:
         if config.data != data:  # the protocol has determined other data
             pairs = load_pairs(parts.dataset)
         pairs, style = steps.select_pairs(pairs, config)

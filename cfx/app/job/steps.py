@@ -41,8 +41,8 @@ from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
 from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
-from cfx.results.store import folder_of, is_run_id
 from cfx.results.table import Findings
+from cfx.results.tracker import folder_of, is_run_id
 from cfx.simulation.memory import MemorySimulator
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.settings import WindowSettings

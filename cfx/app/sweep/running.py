@@ -192,24 +192,17 @@ class Sweep:
         return code
 
     def _close_runs(self) -> tuple[str, ...]:
-        """Closes MLflow's runs that killed jobs left open; returns lines that lead to them."""
+        """Closes runs that killed jobs left open; returns lines that lead to them."""
         from cfx.core.errors import TrackingError
-        from cfx.results.store import sqlite_file, tracking_uri
+        from cfx.core.registry import names
+        from cfx.results.tracker import tracking_named
 
-        if not self.tracking.get("enabled"):
+        name = str(self.tracking.get("name"))
+        if not self.tracking.get("enabled") or name not in names("tracker"):
             return ()
+        sweep = self.tracking.get("sweep") or self.record.name
         try:
-            uri = tracking_uri(self.tracking.get("uri"))
-            file = sqlite_file(uri)
-            if file is not None and not file.is_file():
-                return ()
-            from cfx.results.tracker import end_sweep
-
-            return end_sweep(
-                uri,
-                str(self.tracking.get("experiment")),
-                self.tracking.get("sweep") or self.record.name,
-            )
+            return tracking_named(name).end_sweep(self.tracking, sweep)
         except TrackingError as error:
             log.warning("%s", error)
             return ()

@@ -14,7 +14,7 @@ from pythonfmu3 import FmuBuilder
 
 from cfx.core.command import ExportFormat
 from cfx.core.files import write_output
-from cfx.results.store import folder_of
+from cfx.results.tracker import folder_of
 from cfx_onnx.export import OnnxExport
 
 NAME = "driver.fmu"

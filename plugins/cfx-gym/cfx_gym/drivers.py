@@ -7,7 +7,7 @@ from pathlib import Path
 from cfx.policies.agent import Agent
 from cfx.policies.checkpoint import load
 from cfx.policies.driver_step import DriverStep
-from cfx.results.store import folder_of
+from cfx.results.tracker import folder_of
 
 
 def driver_step(driver: str | Path | Agent) -> DriverStep:

@@ -17,7 +17,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.checkpoint import load
 from cfx.policies.driver_step import DriverStep
 from cfx.policies.placement import ALL
-from cfx.results.store import folder_of
+from cfx.results.tracker import folder_of
 from cfx_onnx.agreement import largest_difference
 from cfx_onnx.card import card
 from cfx_onnx.graph import graph_of

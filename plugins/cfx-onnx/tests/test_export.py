@@ -22,7 +22,7 @@ from cfx.policies.base import PolicyNetwork
 from cfx.policies.checkpoint import load, save
 from cfx.policies.core import AgentCore
 from cfx.policies.driver_step import DriverStep, Motion
-from cfx.results.store import folder_of
+from cfx.results.tracker import folder_of
 from cfx_onnx.export import OnnxExport
 from cfx_onnx.graph import graph_of
 from tests.agents import adaptive

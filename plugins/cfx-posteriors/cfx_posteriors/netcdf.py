@@ -21,8 +21,8 @@ from cfx.core.errors import DataError
 from cfx.core.files import write_output
 from cfx.core.job_folder import read_yaml
 from cfx.core.registry import create
-from cfx.results.store import folder_of
 from cfx.results.table import read_tables
+from cfx.results.tracker import folder_of
 
 NAME = "posterior.nc"
 

@@ -37,7 +37,7 @@ from cfx.policies.fixed import FixedPolicy
 from cfx.policies.heads.direct import DirectHead
 from cfx.policies.placement import ALL
 from cfx.policies.valid_range import share_in_words
-from cfx.results.store import folder_of
+from cfx.results.tracker import folder_of
 from cfx.simulation.settings import WindowSettings
 from cfx.simulation.step import advance_vehicle
 from cfx_sumo.live.braking import hardest_braking

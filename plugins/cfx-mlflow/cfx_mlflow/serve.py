@@ -152,13 +152,15 @@ def open_when_ready(port: str, link: str) -> None:
 
 
 def _open_later(port: int, link: str) -> None:
-    code = "import sys; from cfx_ui.serve import open_when_ready; open_when_ready(*sys.argv[1:])"
+    code = (
+        "import sys; from cfx_mlflow.serve import open_when_ready; open_when_ready(*sys.argv[1:])"
+    )
     command = [sys.executable, "-c", code, str(port), link]
     subprocess.Popen(command)  # noqa: S603 - this interpreter, and what is written above
 
 
 def _store(uri: str | None) -> str:
-    from cfx.results.store import absolute_uri, check_database, sqlite_file, tracking_uri
+    from cfx_mlflow.store import absolute_uri, check_database, sqlite_file, tracking_uri
 
     store = tracking_uri(None)
     if uri:
@@ -191,8 +193,8 @@ def _client(store: str) -> MlflowClient:
 
 def _close_abandoned(store: str) -> None:
     """Marks runs KILLED that a killed process left RUNNING."""
-    from cfx.results.store import open_store, translate_errors
-    from cfx.results.tracker import close_abandoned
+    from cfx_mlflow.store import open_store, translate_errors
+    from cfx_mlflow.tracker import close_abandoned
 
     with translate_errors(f"close abandoned runs in {store}"):
         names = [one.name for one in _client(store).search_experiments()]
@@ -204,7 +206,7 @@ def _close_abandoned(store: str) -> None:
 
 def _links(store: str, port: int) -> list[str]:
     """Returns what to print: the newest sweeps and single jobs, and a page per experiment."""
-    from cfx.results.store import translate_errors
+    from cfx_mlflow.store import translate_errors
 
     with translate_errors(f"read {store}"):
         client = _client(store)

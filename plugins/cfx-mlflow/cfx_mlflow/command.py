@@ -29,7 +29,7 @@ class UiCommand(Command):
         return parser
 
     def run(self, options: argparse.Namespace) -> int:
-        from cfx_ui.serve import serve
+        from cfx_mlflow.serve import serve
 
         serve(options.uri, options.port, open_browser=options.open)
         return 0

@@ -24,8 +24,6 @@ from filelock import BaseFileLock, Timeout
 
 from cfx.core.errors import TrackingError
 from cfx.core.files import lock_for
-from cfx.core.storage import is_url, local_folder
-from cfx.policies.ready import folder_of_ready_made, is_ready_made
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -290,28 +288,6 @@ def download_run(run_id: str, uri: str | None = None) -> Path:
     store = open_store(address, "cfx")
     with translate_errors(f"read run {run_id} from {address}"):
         return Path(store.client.download_artifacts(run_id, ""))
-
-
-def folder_of(folder_or_run: str | Path, uri: str | None = None) -> Path:
-    """Returns the folder of a finished job, which may be given as the id of its MLflow run.
-
-    Args:
-        folder_or_run: a ready-made policy (`cfx://NAME`); the URL of a job's folder (`output.url`);
-            an output folder, if it is there (`~` is the user's home); else a run.
-        uri: as `download_run` takes it.
-
-    Raises:
-        DataError: there is no such ready-made policy, or nothing at the URL.
-        TrackingError: it is no folder, and there is no such run, or its files are gone.
-    """
-    if is_ready_made(folder_or_run):
-        return folder_of_ready_made(str(folder_or_run))
-    if is_url(folder_or_run):
-        return local_folder(str(folder_or_run))
-    folder = Path(folder_or_run).expanduser()
-    if folder.is_dir():
-        return folder
-    return download_run(str(folder_or_run), uri)
 
 
 def _import_databases() -> None:

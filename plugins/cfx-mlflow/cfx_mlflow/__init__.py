@@ -1,0 +1,1 @@
+"""Jobs in MLflow: their runs, and its user interface with tables and charts set up."""

@@ -1,1 +1,0 @@
-"""The tracked jobs in the user interface of MLflow."""
