@@ -21,7 +21,8 @@ def options_of(folder: Path) -> set[tuple[str, str]]:
         "entry-points"
     ]
     found = set()
-    for kind in (*registry.KINDS.values(), registry.PARTS["export"], registry.PARTS["posterior"]):
+    parts = (registry.PARTS[name] for name in ("export", "posterior", "tracker"))
+    for kind in (*registry.KINDS.values(), *parts):
         for name in points.get(kind.entry_points, ()):
             found.add((kind.group, name))
     for path in folder.glob("cfx_*/conf/*/*.yaml"):

@@ -26,6 +26,7 @@ READERS = {
     "cfx.data.resample",
     "cfx.data.sites",
     "cfx.data.table",
+    "cfx.data.tidy",
     "cfx.data.tracks",
 }
 FIGURES = {
@@ -59,6 +60,7 @@ RESULTS = {
     "cfx.evaluation.sites",
     "cfx.evaluation.tables",
     "cfx.learners.curves",
+    "cfx.results.config",
     "cfx.results.provenance",
     "cfx.results.tracker",
 }
@@ -218,7 +220,7 @@ def is_public(module: str, name: str) -> bool:
     """Says whether a plugin may use `name` of `module`; "" is the module itself."""
     if module == "cfx":
         return name in {"", "contracts", *cfx.__all__}
-    if f"{module}.{name}" in DOCUMENTED:
+    if f"{module}.{name}" in DOCUMENTED | PUBLIC_MODULES:
         return True
     known = (
         module in PUBLIC_MODULES or module == "cfx.contracts" or module.startswith("cfx.contracts.")
