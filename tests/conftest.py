@@ -25,8 +25,8 @@ from omegaconf import OmegaConf
 from cfx.data.pairs import PairSet
 from cfx.evaluation.platoon import Manoeuvre, measure_platoons
 from cfx.evaluation.protocols import held_out, within_driver
-from cfx.results import store
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx_mlflow import store
 
 pytest_plugins = ["tests.browser"]
 
