@@ -9,6 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import pytest
 
 traci = pytest.importorskip("traci", reason="needs the extra sumo")
@@ -59,7 +60,7 @@ def connected(server: Server) -> Iterator[Any]:
 def test_speeds_of_many_vehicles_are_few_messages() -> None:
     server = Server()
     with connected(server) as connection:
-        set_speeds(connection, [f"car{number}" for number in range(1200)], [3.0] * 1200)
+        set_speeds(connection, [f"car{number}" for number in range(1200)], np.full(1200, 3.0))
         connection.vehicle.setSpeed("car0", 4.0)
     assert server.messages == [500, 500, 200, 1]
 
@@ -68,6 +69,6 @@ def test_a_vehicle_that_sumo_does_not_know_is_an_error_and_the_connection_goes_o
     server = Server(fails_at=2)
     with connected(server) as connection:
         with pytest.raises(traci.TraCIException, match="no such vehicle"):
-            set_speeds(connection, ["a", "b", "nobody", "c"], [1.0, 2.0, 3.0, 4.0])
-        set_speeds(connection, ["a"], [5.0])
+            set_speeds(connection, ["a", "b", "nobody", "c"], np.array([1.0, 2.0, 3.0, 4.0]))
+        set_speeds(connection, ["a"], np.array([5.0]))
     assert server.messages == [4, 1]

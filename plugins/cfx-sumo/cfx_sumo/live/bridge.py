@@ -95,9 +95,9 @@ class Bridge:
             return None
         return Read(rows, others.raw[:length].decode().split("\0")[:-1], values)
 
-    def set_speeds(self, names: Sequence[str], speeds: Sequence[float]) -> int:
+    def set_speeds(self, names: Sequence[str], speeds: NDArray[np.float64]) -> int:
         """Tells SUMO the next speeds of vehicles, m/s; returns how many it took."""
-        told = np.array(speeds, dtype=np.float64)
+        told = np.ascontiguousarray(speeds)
         count: int = self._compiled.cfx_tell(
             ctypes.c_void_p(self._setter),
             ctypes.c_int64(len(names)),

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import compress
 from pathlib import Path
 from typing import TypedDict, Unpack, cast
 
@@ -50,9 +51,6 @@ from cfx_sumo.live.vehicles import VehicleTable
 
 _BOUNDS_BRAKING = 4
 """Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""
-
-_NEVER = torch.tensor([torch.nan], dtype=torch.float64)
-"""Time of the last frame of a vehicle that is not known, s."""
 
 _BLOCK = 1024
 """Vehicles for which the networks answer at once: what more of them need exceeds the processor's
@@ -239,6 +237,8 @@ class Driver:
         self._leaders: dict[str, str] = {}
         self._slots: dict[str, int] = {}
         self._unused: list[int] = []
+        self._asked: list[str] = []
+        self._asked_slots = torch.empty(0, dtype=torch.int64)
         self._store = VehicleTable.empty(policy, self._driven, 0)
         self._swept = math.nan
         self._now = -math.inf
@@ -469,34 +469,20 @@ class Driver:
             self._forget_all()
         self._now = now
         self._forget_departed(connection, now)
-        self._forget_gone(connection, names, now)
-        due, between = self._due(names, now, clock)
-        view = look(connection, due, self.look_ahead)
+        slots = self._asked_for(connection, names, now)
+        times = self._store.time[slots]
+        early = now - times < clock.period - 0.5 * clock.dt
+        between: list[str] = []
+        if bool(early.any()):
+            between = list(compress(names, (early & (times != now)).tolist()))
+            names, slots = list(compress(names, (~early).tolist())), slots[~early]
+        view = look(connection, names, self.look_ahead)
+        slots = slots[view.order]
         if drive:
             self._hold(connection, between, now, clock)
-            yield from self._drive(connection, view, now, clock, together)
+            yield from self._drive(connection, view, slots, now, clock, together)
         else:
-            self._watch(connection, view, now, clock)
-
-    def _due(self, names: list[str], now: float, clock: Clock) -> tuple[list[str], list[str]]:
-        """Returns the vehicles whose model takes a step now, and those that hold the last one.
-
-        Vehicles that were stepped at this instant before are neither.
-        """
-        slots = torch.tensor([self._slots.get(name, -1) for name in names], dtype=torch.int64)
-        times = torch.where(slots < 0, torch.nan, torch.cat([self._store.time, _NEVER])[slots])
-        early = now - times < clock.period - 0.5 * clock.dt
-        if not bool(early.any()):
-            return names, []
-        due, between = [], []
-        for name, is_early, is_done in zip(
-            names, early.tolist(), (times == now).tolist(), strict=True
-        ):
-            if not is_early:
-                due.append(name)
-            elif not is_done:
-                between.append(name)
-        return due, between
+            self._watch(connection, view, slots, now, clock)
 
     def _hold(self, connection: Connection, names: list[str], now: float, clock: Clock) -> None:
         """Lets vehicles go on as they accelerate, in the steps between two of the model."""
@@ -506,12 +492,13 @@ class Driver:
         store, slots = self._store, self._slots_of(driven)
         passed = now + clock.dt - store.time[slots]
         store.told[slots] = store.start[slots] + store.ramp[slots] * passed
-        set_speeds(connection, driven, store.told[slots].tolist())
+        set_speeds(connection, driven, store.told[slots].numpy())
 
     def _drive(
         self,
         connection: Connection,
         view: View,
+        slots: Tensor,
         now: float,
         clock: Clock,
         together: Together | None,
@@ -521,7 +508,6 @@ class Driver:
         if not names:
             return
         count = len(view.following)
-        slots = self._places(names)
         store = self._store
         following = slots[:count]
         self._count_changed(slots, view.seen, now, clock)
@@ -556,21 +542,25 @@ class Driver:
         if clock.held > 1:
             told = first + store.ramp[slots] * clock.dt
         store.told[slots] = told
-        brakes_hard = dict.fromkeys(self._raised.keys() & names, 0.0)
+        brakes_hard = {}
+        if self._raised:
+            brakes_hard = dict.fromkeys(self._raised.keys() & names, 0.0)
         for index in hardest.nonzero().flatten().tolist():
             brakes_hard[names[index]] = float(hardest[index])
         for name, own in brakes_hard.items():
             self._set_decel(connection, name, own)
-        set_speeds(connection, names, told.tolist())
+        set_speeds(connection, names, told.numpy())
 
-    def _watch(self, connection: Connection, view: View, now: float, clock: Clock) -> None:
+    def _watch(
+        self, connection: Connection, view: View, slots: Tensor, now: float, clock: Clock
+    ) -> None:
         """Lets the policy see vehicles that somebody else drives."""
         for name in view.alone:
             self.release(connection, name)
         if not view.following:
             return
         count = len(view.following)
-        slots = self._places(view.following)
+        slots = slots[:count]
         seen = self._remember(slots, view, now, clock).rows(slice(count))
         store = self._store
         for number in range(clock.substeps):
@@ -709,6 +699,7 @@ class Driver:
         self._speed_modes.pop(vehicle, None)
         self._leaders.pop(vehicle, None)
         self._raised.pop(vehicle, None)
+        self._asked = []
         slot = self._slots.pop(vehicle, None)
         if slot is not None:
             self._unused.append(slot)
@@ -778,6 +769,17 @@ class Driver:
             slot = self._slots.get(name)
             if slot is not None and float(self._store.time[slot]) != now:
                 self.forget(name)
+
+    def _asked_for(self, connection: Connection, names: list[str], now: float) -> Tensor:
+        """Returns the rows of vehicles, `(D,)` int64, and drops those that have left.
+
+        Mostly the same vehicles are asked for step after step: then nothing is looked up.
+        """
+        if names != self._asked or len(names) != len(self._slots):
+            self._forget_gone(connection, names, now)
+            self._asked_slots = self._places(names)
+            self._asked = list(names)
+        return self._asked_slots
 
     def _forget_gone(self, connection: Connection, names: list[str], now: float) -> None:
         """Drops vehicles that have left.

@@ -6,6 +6,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cfx_sumo.live.bridge import bridge_of
 from cfx_sumo.live.surroundings import Connection
 
@@ -13,7 +16,7 @@ _TOGETHER = 500
 """Commands in one message over TraCI."""
 
 
-def set_speeds(connection: Connection, names: Sequence[str], speeds: Sequence[float]) -> None:
+def set_speeds(connection: Connection, names: Sequence[str], speeds: NDArray[np.float64]) -> None:
     """Tells SUMO the next speeds of D vehicles, m/s.
 
     In libsumo that is one compiled call. Over TraCI each command is a message that waits for its
@@ -25,7 +28,9 @@ def set_speeds(connection: Connection, names: Sequence[str], speeds: Sequence[fl
     for first in range(told, len(names), _TOGETHER):
         with _one_message(connection.vehicle):
             for name, speed in zip(
-                names[first : first + _TOGETHER], speeds[first : first + _TOGETHER], strict=True
+                names[first : first + _TOGETHER],
+                speeds[first : first + _TOGETHER].tolist(),
+                strict=True,
             ):
                 tell(name, speed)
 

@@ -78,8 +78,8 @@ _SUBSCRIBED = (_SPEED, _ACCELERATION, _ALLOWED_SPEED, _MIN_GAP)
 _FARTHEST = 1e6
 """m: no gap is larger."""
 
-_ANOTHER = -1
-"""Row of a leader who is not among the vehicles that are read."""
+_ANOTHER, _NOBODY = -1, -2
+"""Rows of a leader who is not among the vehicles that are read, and of none."""
 
 
 class View(NamedTuple):
@@ -92,6 +92,7 @@ class View(NamedTuple):
         seen: what all D do, those with a leader first. The others have a leader that is as fast as
             they are, a thousand kilometres ahead.
         rows: of the leaders among the D vehicles, `(D,)` int64; below 0: another vehicle, or none.
+        order: which of the vehicles that were asked for each is, `(D,)` int64.
     """
 
     following: list[str]
@@ -99,6 +100,7 @@ class View(NamedTuple):
     alone: list[str]
     seen: Seen
     rows: Tensor
+    order: Tensor
 
     def leader_speeds(self, speed: Tensor, others: Mapping[str, float]) -> Tensor:
         """Returns the speeds of leaders that are driven too, `(D,)`, m/s; NaN of other leaders.
@@ -142,13 +144,13 @@ class Columns(NamedTuple):
     """What SUMO says of D vehicles.
 
     Attributes:
-        ahead: the next vehicle ahead of each; "" where there is none.
-        rows: places of those among the D vehicles, `(D,)`; below 0: they are others, or none.
+        ahead: the next vehicle ahead of each, `(D,)`; "" where there is none.
+        rows: places of those among the D vehicles, `(D,)`; -1: it is another; -2: there is none.
         values: gap to it without `minGap`, speed, acceleration, `minGap` and allowed speed,
             `(5, D)`, SI units, as TraCI's getters answer.
     """
 
-    ahead: list[str]
+    ahead: NDArray[np.object_]
     rows: NDArray[np.int64]
     values: NDArray[np.float64]
 
@@ -159,9 +161,9 @@ def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahea
         rows = [reader.row(name) for name in names]
         ahead = [leader[0] if leader else "" for leader, *_ in rows]
         values = np.array([(leader[1] if leader else np.inf, *row) for leader, *row in rows])
-        places = {name: row for row, name in enumerate(names)}
-        at = np.array([places.get(name, -1) for name in ahead], dtype=np.int64)
-        columns = Columns(ahead, at, values.reshape(-1, 5).T)
+        places = {name: row for row, name in enumerate(names)} | {"": _NOBODY}
+        at = np.array([places.get(name, _ANOTHER) for name in ahead], dtype=np.int64)
+        columns = Columns(np.array(ahead, dtype=object), at, values.reshape(-1, 5).T)
         return _view(names, columns, reader, look_ahead)
     except Exception as error:
         # libsumo's and traci's are two classes of this name.
@@ -175,13 +177,8 @@ def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahea
 
 def _columns_of(names: list[str], read: Read) -> Columns:
     """Returns columns of what the bridge has read."""
-    others = iter(read.others)
-    ahead = []
-    for row in read.rows.tolist():
-        if row >= 0:
-            ahead.append(names[row])
-        else:
-            ahead.append(next(others) if row == _ANOTHER else "")
+    ahead = np.array([*names, "", ""], dtype=object)[read.rows]
+    ahead[read.rows == _ANOTHER] = read.others
     return Columns(ahead, read.rows, read.values.T)
 
 
@@ -199,8 +196,7 @@ def _view(
     ahead, rows = columns.ahead, columns.rows
     raw, speed, acceleration, min_gap, allowed = columns.values
     gap = raw + min_gap
-    follows = np.array([name != "" for name in ahead], dtype=bool)
-    follows &= (np.abs(raw) <= _FARTHEST) & (gap <= look_ahead)
+    follows = (rows != _NOBODY) & (np.abs(raw) <= _FARTHEST) & (gap <= look_ahead)
     leader_speed = np.where(follows, speed.take(rows, mode="clip"), speed)
     leader_acceleration = np.where(follows, acceleration.take(rows, mode="clip"), 0.0)
     for row in (follows & (rows < 0)).nonzero()[0].tolist():
@@ -217,12 +213,18 @@ def _view(
     order = np.argsort(~follows, kind="stable")
     seen = Seen(*torch.from_numpy(np.stack(signals)[:, order]).unbind())
     count = int(follows.sum())
-    placed = [names[row] for row in order.tolist()]
-    leaders = [ahead[row] for row in order[:count].tolist()]
+    placed = np.array(names, dtype=object)[order].tolist()
     place = np.empty_like(order)
     place[order] = np.arange(len(order))
     among = np.where(follows & (rows >= 0), place.take(rows, mode="clip"), _ANOTHER)[order]
-    return View(placed[:count], leaders, placed[count:], seen, torch.from_numpy(among))
+    return View(
+        placed[:count],
+        ahead[order[:count]].tolist(),
+        placed[count:],
+        seen,
+        torch.from_numpy(among),
+        torch.from_numpy(order),
+    )
 
 
 def _culprit(reader: DirectReader | SubscribedReader, names: list[str]) -> str:
