@@ -36,6 +36,7 @@ for _ in range(300):
     compiled = look(libsumo, names, 100.0)
     same = all(
         calls[:3] == other[:3]
+        and torch.equal(calls.rows, other.rows)
         and torch.equal(torch.stack(list(calls.seen)), torch.stack(list(other.seen)))
         for other in (sent, compiled)
     )

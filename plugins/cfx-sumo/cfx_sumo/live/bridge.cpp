@@ -5,6 +5,7 @@
 #include <string_view>
 #include <unordered_map>
 #include <utility>
+#include <vector>
 
 #if !defined(_GLIBCXX_USE_CXX11_ABI) || !_GLIBCXX_USE_CXX11_ABI
 #error "libsumo's strings are those of libstdc++'s C++11 ABI"
@@ -16,32 +17,37 @@ using Setter = void (*)(const std::string&, double);
 
 // Reads vehicles: gap to the leader without minGap, then the values of four getters, `(count, 5)`.
 // Names end with 0. A leader's row is its place among the vehicles, -2 where there is none, -1 where
-// it is another vehicle, whose name is then among `others`. Returns the length of those; -1: SUMO
-// does not know a vehicle; -2: there is too little room.
+// it is another vehicle, whose name is then among `others`, and what the first two getters say of it
+// among `motions`, `(others, 2)`. Before, `rows` say where leaders were last: mostly they are there
+// again. Returns the length of the others' names; -1: SUMO does not know a vehicle; -2: there is too
+// little room.
 extern "C" int64_t cfx_read(Leader leader_of, const Getter* getters, int64_t count,
                             const char* names, double reach, double* values, int64_t* rows,
-                            char* others, int64_t room) {
-    std::unordered_map<std::string_view, int64_t> places;
-    places.reserve(2 * count);
-    const char* at = names;
-    for (int64_t i = 0; i < count; ++i) {
-        const std::string_view name(at);
-        places.emplace(name, i);
-        at += name.size() + 1;
+                            char* others, double* motions, int64_t room) {
+    std::vector<std::string_view> known;
+    known.reserve(count);
+    for (const char* at = names; static_cast<int64_t>(known.size()) < count;) {
+        known.emplace_back(at);
+        at += known.back().size() + 1;
     }
-    at = names;
+    std::unordered_map<std::string_view, int64_t> places;
     char* end = others;
     std::string name;
     try {
         for (int64_t i = 0; i < count; ++i) {
-            name = at;
-            at += name.size() + 1;
+            name = known[i];
             const auto leader = leader_of(name, reach);
             double* value = values + 5 * i;
             *value = leader.second;
             for (int k = 0; k < 4; ++k) value[k + 1] = getters[k](name);
+            const int64_t last = rows[i];
+            if (last >= 0 && last < count && known[last] == leader.first) continue;
             rows[i] = -2;
             if (leader.first.empty()) continue;
+            if (places.empty()) {
+                places.reserve(2 * count);
+                for (int64_t k = 0; k < count; ++k) places.emplace(known[k], k);
+            }
             const auto found = places.find(leader.first);
             rows[i] = found == places.end() ? -1 : found->second;
             if (rows[i] >= 0) continue;
@@ -49,6 +55,7 @@ extern "C" int64_t cfx_read(Leader leader_of, const Getter* getters, int64_t cou
             if (end + size > others + room) return -2;
             std::memcpy(end, leader.first.c_str(), size);
             end += size;
+            for (int k = 0; k < 2; ++k) *motions++ = getters[k](leader.first);
         }
     } catch (...) {
         return -1;

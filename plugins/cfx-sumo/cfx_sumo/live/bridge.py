@@ -41,12 +41,14 @@ class Read(NamedTuple):
         rows: place of each vehicle's leader among them, `(D,)` int64; -1: it is another vehicle;
             -2: there is none.
         others: names of those other leaders, in order.
+        motions: their speeds and accelerations, `(others, 2)`, SI units.
         values: gap to the leader without `minGap`, speed, acceleration, `minGap` and allowed
             speed, `(D, 5)`, SI units.
     """
 
     rows: NDArray[np.int64]
     others: list[str]
+    motions: NDArray[np.float64]
     values: NDArray[np.float64]
 
 
@@ -67,6 +69,7 @@ class Bridge:
         addresses = [_address(libsumo, name) for name in _GETTERS]
         self._getters = (ctypes.c_void_p * len(addresses))(*addresses)
         self._setter = _address(libsumo, _SETTER)
+        self._rows = np.empty(0, dtype=np.int64)
         compiled.cfx_read.restype = compiled.cfx_tell.restype = ctypes.c_int64
 
     def read(self, names: Sequence[str], reach: float) -> Read | None:
@@ -78,7 +81,10 @@ class Bridge:
         """
         count = len(names)
         values = np.empty((count, 5))
-        rows = np.empty(count, dtype=np.int64)
+        # Where leaders were at the last read: a hint, which the compiled function checks.
+        rows = np.full(count, -2, dtype=np.int64)
+        rows[: len(self._rows)] = self._rows[:count]
+        motions = np.empty((count, 2))
         others = ctypes.create_string_buffer(_ROOM * count + _ROOM)
         length = self._compiled.cfx_read(
             ctypes.c_void_p(self._leader),
@@ -89,11 +95,14 @@ class Bridge:
             values.ctypes.data_as(ctypes.c_void_p),
             rows.ctypes.data_as(ctypes.c_void_p),
             others,
+            motions.ctypes.data_as(ctypes.c_void_p),
             ctypes.c_int64(len(others)),
         )
         if length < 0:
             return None
-        return Read(rows, others.raw[:length].decode().split("\0")[:-1], values)
+        self._rows = rows
+        found = others.raw[:length].decode().split("\0")[:-1]
+        return Read(rows, found, motions[: len(found)], values)
 
     def set_speeds(self, names: Sequence[str], speeds: NDArray[np.float64]) -> int:
         """Tells SUMO the next speeds of vehicles, m/s; returns how many it took."""

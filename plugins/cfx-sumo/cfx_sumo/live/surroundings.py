@@ -5,7 +5,7 @@ Shapes: D vehicles.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -134,9 +134,8 @@ def look(connection: Connection, names: list[str], look_ahead: float) -> View:
     if bridge is not None:
         read = bridge.read(names, look_ahead)
         if read is not None:
-            return _view(
-                names, _columns_of(names, read), DirectReader(vehicle, look_ahead), look_ahead
-            )
+            motions = dict(zip(read.others, read.motions.tolist(), strict=True))
+            return _view(names, _columns_of(names, read), motions.__getitem__, look_ahead)
     return view_of(DirectReader(vehicle, look_ahead), names, look_ahead)
 
 
@@ -164,7 +163,7 @@ def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahea
         places = {name: row for row, name in enumerate(names)} | {"": _NOBODY}
         at = np.array([places.get(name, _ANOTHER) for name in ahead], dtype=np.int64)
         columns = Columns(np.array(ahead, dtype=object), at, values.reshape(-1, 5).T)
-        return _view(names, columns, reader, look_ahead)
+        return _view(names, columns, reader.motion, look_ahead)
     except Exception as error:
         # libsumo's and traci's are two classes of this name.
         if type(error).__name__ != "TraCIException":
@@ -185,11 +184,12 @@ def _columns_of(names: list[str], read: Read) -> Columns:
 def _view(
     names: list[str],
     columns: Columns,
-    reader: DirectReader | SubscribedReader,
+    motion: Callable[[str], Sequence[float]],
     look_ahead: float,
 ) -> View:
     """Returns vehicles and their leaders, those with a leader first.
 
+    `motion` answers speed and acceleration of a leader who is not among the vehicles.
     SUMO's own gap leaves `minGap` out. At some junctions TraCI answers a leader at -1.8e308 m,
     which is none.
     """
@@ -200,7 +200,7 @@ def _view(
     leader_speed = np.where(follows, speed.take(rows, mode="clip"), speed)
     leader_acceleration = np.where(follows, acceleration.take(rows, mode="clip"), 0.0)
     for row in (follows & (rows < 0)).nonzero()[0].tolist():
-        leader_speed[row], leader_acceleration[row] = reader.motion(ahead[row])
+        leader_speed[row], leader_acceleration[row] = motion(ahead[row])
     signals = [
         speed,
         acceleration,
