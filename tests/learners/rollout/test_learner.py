@@ -26,6 +26,7 @@ from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.learners.made import (
+    COMPILED,
     INPUTS,
     QUICK,
     TRUE,
@@ -57,7 +58,7 @@ def test_untrained_it_is_the_fixed_model(has_base: bool) -> None:
 def test_it_learns_to_drive_like_the_drivers() -> None:
     policy, data = gru(), training_data()
     before = error(loop(untrained(data, policy), data, policy), data)
-    result = RolloutLearner(**(QUICK | {"cold_start_fraction": 0.0})).fit(policy, data)
+    result = RolloutLearner(**(COMPILED | {"cold_start_fraction": 0.0})).fit(policy, data)
     assert error(loop(result, data, policy, first=100), data, first=100) < 0.5 * before
     curves = result.curves.groupby("epoch")[["train_loss", "validation_loss"]].mean()
     assert curves.train_loss.iloc[-1] < 0.7 * curves.train_loss.iloc[0]
@@ -92,7 +93,7 @@ _losses_of_objectives: list[list[float]] = []
     ids=lambda o: type(o).__name__,
 )
 def test_it_minimises_the_objective_of_the_job(objective: Objective) -> None:
-    options = QUICK | {"epochs": 3, "steps": 8, "gap_weight": 0.0}
+    options = COMPILED | {"epochs": 3, "steps": 8, "gap_weight": 0.0}
     data = training_data(networks=1, objective=objective, base=TRUE * 1.3)
     losses = RolloutLearner(**options).fit(gru(), data).curves.train_loss.tolist()
     assert losses[-1] < losses[0]
@@ -180,7 +181,7 @@ def test_a_checkpoint_of_another_training_is_not_taken_up(tmp_path: Path) -> Non
 
 def test_nothing_is_learned_from_validation_drivers() -> None:
     """What such a driver does changes the validation loss, and no weight."""
-    policy, settings = gru(), QUICK | {"epochs": 2, "steps": 5, "patience": None}
+    policy, settings = gru(), COMPILED | {"epochs": 2, "steps": 5, "patience": None}
     data = training_data(networks=1)
     dataset = placed(data, policy)
     kept = dataset.validates[0]
@@ -198,7 +199,7 @@ def test_nothing_is_learned_from_validation_drivers() -> None:
 def test_an_ensemble_learns_and_drives_as_one() -> None:
     """Its networks learn different things; to a user it is one, with one learning curve."""
     policy, data = gru(), training_data()
-    result = RolloutLearner(**(QUICK | {"ensemble_size": 3})).fit(policy, data)
+    result = RolloutLearner(**(COMPILED | {"ensemble_size": 3})).fit(policy, data)
     assert isinstance(result.network, Ensemble)
     assert result.curves.network.tolist() == ["n0", "n1"] * 6
     assert result.scaler.mean.shape[0] == len(data.names)
