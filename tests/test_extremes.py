@@ -62,6 +62,7 @@ RECORDINGS = {
     ],
     "gaps of 1 cm": [follower(f"p{i}", 300, lambda t: 1 + 0 * t, 0.01) for i in range(3)],
     "an hour": [follower("p", 7_200, lambda t: 15 + 6 * np.sin(t / 7), 30.0, dt=0.5)],
+    "an hour in steps of 0.1 s": [follower("p", 36_000, lambda t: 15 + 6 * np.sin(t / 7), 30.0)],
     "one window": [
         follower(f"p{i}", 27, lambda t, i=i: 10 + 2 * np.sin(t / (3 + i)), 20.0) for i in range(2)
     ],
@@ -85,7 +86,7 @@ CASES = [
     pytest.param(
         recording,
         model,
-        marks=[] if model == MODELS[recording] else [pytest.mark.slow],
+        marks=[] if model == MODELS.get(recording) else [pytest.mark.slow],
         id=f"{recording}-{model}",
     )
     for recording in RECORDINGS
@@ -101,9 +102,10 @@ def test_the_edges_of_what_is_recorded(
     write_tidy(PairSet(tuple(RECORDINGS[recording]), "test"), path)
     folder = tmp_path / "job"
     job = [*JOB, f"model={model}", f"data.path={path}", f"hydra.run.dir={folder}"]
+    if recording.startswith("an hour"):
+        job += ["windows.length=50", "windows.stride=50"]  # labels of fewer windows
     if recording == "an hour":
-        # Labels of fewer windows; and a prior simulates the whole drive another thirty times.
-        job += ["windows.length=50", "windows.stride=50", "calibration.prior=none"]
+        job += ["calibration.prior=none"]  # it simulates the whole drive another thirty times
     code = cli.main(job)
     out, err = capsys.readouterr()
     assert code == 0, err
