@@ -456,8 +456,10 @@ class Driver:
         That is after each step of the model in a longer one of the simulation.
 
         Args:
-            connection, vehicles, drive: as for `step`.
+            connection: as for `step`.
+            vehicles: as for `step`.
             together: what all drivers of the simulation expect, where this is not the only one.
+            drive: as for `step`.
 
         Raises:
             SumoError: as `step`.
