@@ -122,7 +122,7 @@ class Fit:
 
         Columns are those of `fits.parquet`: `low_NAME`, `median_NAME`, `high_NAME` (SI units),
         `contraction_NAME` (0: the recording says nothing, 1: all) and the noise's; `pareto_k` above
-        0.7 says that a row is not to be relied on.
+        0.7 (of `nuts`: `r_hat` above 1.05) says that a row is not to be relied on.
 
         Raises:
             ConfigError: no posterior was asked for.

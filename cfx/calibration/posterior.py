@@ -34,8 +34,8 @@ class DriverPosteriors(ABC):
         """Returns columns for a row per driver of the table `fits`, `(P,)` each.
 
         `median_NAME`, `low_NAME`, `high_NAME`, `contraction_NAME`, `noise_scale`,
-        `noise_correlation`, `noise_left`, `effective_samples` and `pareto_k`; the table says what
-        they mean.
+        `noise_correlation`, `noise_left`, `effective_samples`, and `pareto_k` or `r_hat` and
+        `divergences`; the table says what they mean.
         """
 
     @abstractmethod

@@ -23,8 +23,8 @@ class CalibrationSettings(Settings):
     posterior: str = Field(
         "none",
         description="intervals of each driver's parameters beside the point estimate. laplace: each"
-        " driver alone; hierarchical: with a prior that all drivers of the job give; none: the"
-        " point estimate alone",
+        " driver alone; nuts: the same by chains; hierarchical: with a prior that all drivers of"
+        " the job give; none: the point estimate alone",
     )
     noise_step_s: float = Field(
         1.0,

@@ -63,6 +63,7 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("policy", "ukf"): "cfx-estimators",
     ("calibration.posterior", "hierarchical"): "cfx-posteriors",
     ("calibration.posterior", "laplace"): "cfx-posteriors",
+    ("calibration.posterior", "nuts"): "cfx-posteriors",
     ("protocol", "forecast"): "cfx-forecasts",
     ("protocol", "traffic"): "cfx-traffic",
     ("simulator", "sumo"): "cfx-sumo",

@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from cfx.calibration.levels import DETERMINED, ENOUGH, LEVEL, RELIABLE
+from cfx.calibration.levels import DETERMINED, DIVERGENT, ENOUGH, LEVEL, MIXED, RELIABLE, reliable
 from cfx.core.parameters import Parameter
 from cfx.results.table import Findings
 
@@ -46,7 +46,7 @@ class KnownParameters:
     @property
     def reliable(self) -> pd.Series:
         """Whether a pair's intervals are to be relied on."""
-        return self.rows["pareto_k"] <= RELIABLE
+        return reliable(self.rows)
 
     def metrics(self) -> dict[str, float]:
         """Returns what MLflow keeps too.
@@ -88,10 +88,15 @@ class KnownParameters:
         doubtful = list(self.rows["pair_id"][~self.reliable])
         if doubtful:
             named = ", ".join(map(str, doubtful[:3])) + (" ..." if len(doubtful) > 3 else "")
+            why = f"samples of these posteriors do not settle (pareto_k above {RELIABLE}"
+            if "r_hat" in self.rows:
+                why = (
+                    f"chains differ or leave out a part (r_hat above {MIXED} or divergences above"
+                    f" {DIVERGENT}"
+                )
             sentences.append(
                 f"Do not rely on the intervals of {len(doubtful)} of {pairs} pairs ({named}):"
-                f" samples of these posteriors do not settle (pareto_k above {RELIABLE} in"
-                " fits.parquet), and such intervals are too narrow."
+                f" {why} in fits.parquet), and such intervals are too narrow."
             )
         few = int((self.reliable & (self.rows["effective_samples"] < ENOUGH)).sum())
         if few:

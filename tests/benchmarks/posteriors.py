@@ -1,6 +1,7 @@
 """What docs/how-to/uncertainty.md says of `calibration.posterior`: coverage, ranks, I-80, time.
 
-python -m tests.benchmarks.posteriors coverage|recording|forecasts|chains krauss|idm|w99
+python -m tests.benchmarks.posteriors coverage|recording|forecasts|chains|nuts|covered krauss|idm|w99
+python -m tests.benchmarks.posteriors reference idm
 """
 
 from __future__ import annotations
@@ -9,31 +10,36 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
+import blackjax
 import emcee
+import jax
+import jax.numpy as jnp
 import numpy as np
 import torch
 from scipy.stats import chisquare
 from scoringrules import crps_ensemble
 from torch import Tensor
 
-from cfx.calibration.levels import DETERMINED
+from cfx.calibration.levels import DETERMINED, MIXED
 from cfx.calibration.optimizers.random import RandomSearch
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.data.pairs import PairBatch
 from cfx.data.tidy import TidyDataset
 from cfx.models.base import DrivingModel
-from cfx.models.idm import IDM
+from cfx.models.idm import CLOSEST, IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Segments
-from cfx_posteriors.density import Posterior
+from cfx_posteriors.density import DEVIATION, Posterior
 from cfx_posteriors.importance import DRAWS, sample
 from cfx_posteriors.intervals import LaplaceMethod, posterior_of
 from cfx_posteriors.laplace import laplace, likely_starts
+from cfx_posteriors.noise import RATE, SHAPE
+from cfx_posteriors.nuts import CHAINS, Chains, effective_samples, walk
 from cfx_posteriors.population import fit_population
 from tests.posteriors.recordings import draw_recordings
 
@@ -45,6 +51,7 @@ CLASSES = 10
 MODELS: dict[str, DrivingModel] = {"krauss": Krauss(), "idm": IDM(), "w99": W99()}
 DRIVERS = {"krauss": 1000, "idm": 300, "w99": 100}
 WALKERS, CHAIN = 40, 4000
+COVERED, REFERENCES, REFERENCE_DRAWS = 60, 2, 100
 FRAMES, AFTER_S = 600, (1, 5, 10, 30)
 AHEAD_S = (1, 2, 3, 5, 10)
 AFTER = ", ".join(map(str, AFTER_S))
@@ -193,6 +200,152 @@ def chains(name: str) -> Iterator[str]:
     )
 
 
+def nuts(name: str) -> Iterator[str]:
+    """Yields how well chains of twenty I-80 drivers mix, and how far weighted samples are off."""
+    posterior = recorded(name, 20)
+    started, began = time.process_time(), time.perf_counter()
+    normal = laplace(posterior, likely_starts(posterior, seed=0))
+    weighted = sample(posterior, normal, SHARES, seed=0, memory=1 << 30)
+    before = time.process_time() - started
+    found = walk(posterior, weighted, SHARES, seed=0, memory=1 << 30)
+    spent, passed = time.process_time() - started, time.perf_counter() - began
+    n, ends = len(posterior.space), [0, 9, 18]
+    off = apart(found, weighted.quantiles[:, ends], n)
+    normal_ends = torch.special.ndtri(SHARES[ends])[:, None]
+    deviation = normal.covariance.diagonal(dim1=1, dim2=2)[:, None, :n].sqrt()
+    of_normal = apart(found, normal.mode[:, None, :n] + normal_ends * deviation, n)
+    effective = found.effective.sort().values
+    yield (
+        f"{type(MODELS[name]).__name__}: {len(effective)} drivers, {spent:.0f} CPU s (weighted"
+        f" samples {before:.1f}), {passed:.0f} s; effective samples: least"
+        f" {float(effective[0]):.0f}, then {', '.join(f'{float(e):.0f}' for e in effective[1:4])},"
+        f" median {float(effective.median()):.0f}; above 400: {int((effective > 400).sum())};"
+        f" R-hat at most {float(found.r_hat.max()):.3f}, median {float(found.r_hat.median()):.3f};"
+        f" divergent {float(found.divergences.mean()):.2%}, at most"
+        f" {float(found.divergences.max()):.1%}; 5, 50 and 95 % apart from weighted samples"
+        f" {float(off.mean()):.2f} deviations in the mean, {float(off.max()):.2f} at most; from"
+        f" Laplace's approximation alone {float(of_normal.mean()):.2f}, {float(of_normal.max()):.1f};"
+        f" effective samples of all drivers in a CPU second {float(effective.sum()) / spent:.1f}"
+    )
+
+
+def apart(found: Chains, quantiles: Tensor, n: int) -> Tensor:
+    """Returns how far 5, 50 and 95 % are from those of chains, in their deviations, `(P, 3, n)`."""
+    off = (quantiles - found.quantiles[:, [0, 9, 18]]).abs()
+    return off / found.draws[..., :n].std(1)[:, None]
+
+
+def recorded(name: str, drivers: int) -> Posterior:
+    """Returns the posterior of the first I-80 drivers of 70 s or more."""
+    pairs = TidyDataset(path=I80, min_frames=700, max_pairs=drivers).load()
+    batch = PairBatch.of(pairs, dtype=torch.float64)
+    solver = Solver(MemoryStepper(MODELS[name], batch.dt), RandomSearch(), seed=0)
+    settings = CalibrationSettings(posterior="nuts")
+    return posterior_of(solver, batch, batch.lengths - 1, settings)
+
+
+def covered(name: str) -> Iterator[str]:
+    """Yields how often 90 % intervals of chains hold the truth, of synthetic drivers of 60 s."""
+    drawn = draw_recordings(MODELS[name], COVERED, frames=FRAMES, seed=12)
+    normal = laplace(drawn.posterior, likely_starts(drawn.posterior, seed=0))
+    weighted = sample(drawn.posterior, normal, SHARES, seed=0, memory=1 << 30)
+    found = walk(drawn.posterior, weighted, SHARES, seed=0, memory=1 << 30)
+    n = len(drawn.posterior.space)
+    off = apart(found, weighted.quantiles[:, [0, 9, 18]], n)
+    yield f"apart from weighted samples {float(off.mean()):.2f}, {float(off.max()):.2f} at most"
+    for label, quantiles in (("chains", found.quantiles), ("weighted", weighted.quantiles)):
+        ranks = (drawn.truth[:, None, :n] > quantiles).sum(1)
+        held = ((ranks > 0) & (ranks < 19)).double()
+        counts = torch.stack([torch.histc(r.double(), CLASSES // 2, 0, 20) for r in ranks.T])
+        least = min(float(chisquare(one).pvalue) for one in counts.numpy())
+        yield (
+            f"{type(MODELS[name]).__name__}, {COVERED} drivers, {label}: held"
+            f" {float(held.mean()):.1%}, each parameter {shares(held)}; ranks"
+            f" {' '.join(f'{c:.0f}' for c in counts.sum(0))}, least p {least:.3f}; reliable"
+            f" {float((found.r_hat <= MIXED).double().mean()):.0%}, divergent"
+            f" {float(found.divergences.mean()):.2%}, effective {float(found.effective.median()):.0f}"
+        )
+
+
+def reference(name: str) -> Iterator[str]:
+    """Yields what the usual way takes: IDM and its noise in JAX, a driver at a time.
+
+    Slopes are JAX's, chains start at the mode, step and masses are adapted (blackjax, as Stan does).
+    """
+    posterior = recorded(name, REFERENCES)
+    space, d = posterior.space, posterior.dimensions
+    mode = laplace(posterior, likely_starts(posterior, seed=0)).mode
+    low, high = (bound.double().numpy() for bound in space.bounds())
+    prior, limits = posterior.prior, MODELS[name].limits
+    assert prior.center is not None
+    assert limits is not None
+    center, dt = prior.center.numpy(), posterior.segments.simulator.dt
+    with jax.enable_x64(True):
+        for driver in range(REFERENCES):
+            one = posterior.take(torch.tensor([driver])).segments.segments
+            steps = int(one.counted.sum())
+            leader = np.stack([one.leader_position[:steps, 0], one.leader_speed[:steps, 0]], 1)
+            measured = one.measured_speed[:steps, 0].numpy()
+            length = float(one.leader_length[0])
+            first = jnp.array([float(one.position[0]), float(one.speed[0])])
+
+            def density(
+                place: jax.Array,
+                leader: np.ndarray = leader,
+                measured: np.ndarray = measured,
+                length: float = length,
+                first: jax.Array = first,
+            ) -> jax.Array:
+                v0, t, s0, a, b = low + (high - low) * jax.nn.sigmoid(place[:5])
+
+                def step(state: jax.Array, seen: jax.Array) -> tuple[jax.Array, jax.Array]:
+                    x, v = state
+                    gap = jnp.maximum(seen[0] - length - x, CLOSEST)
+                    wanted = v * t + v * (v - seen[1]) / (2.0 * jnp.sqrt(a * b))
+                    crowding = (s0 + jnp.maximum(wanted, 0.0)) / gap
+                    new = v + dt * a * (1.0 - (v / v0) ** 4 - crowding**2)
+                    slowest = jnp.maximum(v - limits.emergency_deceleration * dt, 0.0)
+                    new = jnp.clip(new, slowest, v + limits.acceleration * dt)
+                    return jnp.array([x + new * dt, new]), new
+
+                _, speed = jax.lax.scan(step, first, leader)
+                error = (speed - measured)[posterior.stride - 1 :: posterior.stride]
+                phi, scale = jnp.tanh(place[5]), place[6]
+                left = error - phi * jnp.concatenate([jnp.zeros(1), error[:-1]])
+                whole = -len(error) * scale - 0.5 * (left**2).sum() * jnp.exp(-2.0 * scale)
+                whole += jnp.log1p(-(phi**2)) - 2.0 * SHAPE * scale - RATE * jnp.exp(-2.0 * scale)
+                return whole - 0.5 * ((place[:5] - center) ** 2).sum() / DEVIATION**2
+
+            here = jnp.asarray(mode[driver].numpy())
+            ours = posterior.take(torch.tensor([driver]))(mode[driver][None, None])
+            assert abs(float(density(here)) - float(ours)) < 1e-6 * abs(float(ours))
+            warm = blackjax.window_adaptation(blackjax.nuts, density)
+
+            def chain(
+                key: jax.Array, here: jax.Array = here, warm: Any = warm, density: Any = density
+            ) -> tuple[jax.Array, jax.Array]:
+                (state, tuned), _ = warm.run(key, here, num_steps=REFERENCE_DRAWS)
+                step = blackjax.nuts(density, **tuned).step
+
+                def draw(state: Any, key: jax.Array) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+                    state, said = step(key, state)
+                    return state, (state.position, said.num_integration_steps)
+
+                keys = jax.random.split(jax.random.fold_in(key, 1), REFERENCE_DRAWS)
+                return jax.lax.scan(draw, state, keys)[1]
+
+            started = time.process_time()
+            keys = jax.random.split(jax.random.key(driver), CHAINS)
+            places, trees = jax.block_until_ready(jax.jit(jax.vmap(chain))(keys))
+            spent = time.process_time() - started
+            effective = effective_samples(np.asarray(places)[None])[0]
+            yield (
+                f"driver {driver}: {effective:.0f} effective samples of {d} coordinates in"
+                f" {spent:.0f} CPU s, {effective / spent:.2f} in a CPU second, trees of"
+                f" {float(trees.mean()):.0f} steps"
+            )
+
+
 def forecasts(name: str) -> Iterator[str]:
     """Yields scores of forecasts of speed from each second of the last fifth of I-80's pairs.
 
@@ -265,6 +418,9 @@ if __name__ == "__main__":
         "recording": recording,
         "forecasts": forecasts,
         "chains": chains,
+        "nuts": nuts,
+        "covered": covered,
+        "reference": reference,
     }
     for line in programs[sys.argv[1]](sys.argv[2]):
         print(line, flush=True)

@@ -26,6 +26,10 @@ DEVIATION = 1.5
 between 0.08 and 0.92 of its range with 90 %."""
 
 
+DIFFERENCE = 1e-5
+"""Distance in a logit over which slopes are measured."""
+
+
 @dataclass(frozen=True)
 class SignalErrors:
     """Simulated minus measured, of one signal.
@@ -199,3 +203,33 @@ class Posterior:
         products = noise.lagged_products(self.errors(place[..., :n]), self.counted, self.order)
         likelihood = noise.log_density(products, self.count, place[..., n:])
         return likelihood + self.prior.log_density(place[..., :n])
+
+    def with_slope(self, place: Tensor) -> tuple[Tensor, Tensor]:
+        """Returns the log density whatever the noise's scale, `(P, q)`, and its slope.
+
+        Slopes of parameters are differences: any model has them.
+
+        Args:
+            place: coordinates but for the last, `(P, q, d - 1)`.
+        """
+        n = len(self.space)
+        shift = DIFFERENCE * torch.eye(n, dtype=place.dtype)
+        logits = place[..., None, :n] + torch.cat([torch.zeros_like(shift[:1]), shift])
+        asked = logits.flatten(1, 2)
+        products = noise.lagged_products(self.errors(asked), self.counted, self.order)
+        products = products.view(*logits.shape[:3], *products.shape[-2:])
+        with torch.enable_grad():
+            own = place[..., None, n:].detach().requires_grad_()
+            density = noise.marginal_log_density(products, self.count[..., None], own)
+            (of_noise,) = torch.autograd.grad(density[..., 0].sum(), own)
+        density = density.detach() + self.prior.log_density(asked).view_as(density)
+        of_parameters = (density[..., 1:] - density[..., :1]) / DIFFERENCE
+        return density[..., 0], torch.cat([of_parameters, of_noise[..., 0, :]], dim=-1)
+
+    def draw_scales(self, place: Tensor, generator: torch.Generator) -> Tensor:
+        """Returns the last coordinates, `(P, q, 1)`, as likely as the others `(P, q, d - 1)`."""
+        n = len(self.space)
+        products = noise.lagged_products(self.errors(place[..., :n]), self.counted, self.order)
+        shape, rate = noise.scale_gamma(products, self.count, place[..., n:])
+        gamma = torch._standard_gamma(shape.expand_as(rate).contiguous(), generator=generator)  # noqa: SLF001 - the only one with a generator
+        return 0.5 * (rate / gamma).log()[..., None]

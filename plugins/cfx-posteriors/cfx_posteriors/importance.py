@@ -87,6 +87,16 @@ class Sampled(NamedTuple):
         """Whether the samples stand in for the posterior, bool `(P,)`."""
         return self.pareto_k <= RELIABLE
 
+    @property
+    def chains(self) -> int:
+        """Draws are independent."""
+        return 1
+
+    @property
+    def diagnostics(self) -> dict[str, Tensor]:
+        """What says how far to trust them, `(P,)` each."""
+        return {"pareto_k": self.pareto_k}
+
 
 class _Components(NamedTuple):
     """Student's t distributions.

@@ -5,8 +5,9 @@ Shapes: P drivers, n tuned parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -24,9 +25,12 @@ from cfx.data.pairs import PairBatch
 from cfx.simulation.trajectory import Segments
 from cfx_posteriors.density import ParameterPrior, Posterior
 from cfx_posteriors.fan import Fan, fan_of
-from cfx_posteriors.importance import sample
+from cfx_posteriors.importance import DRAWS, Sampled, sample
 from cfx_posteriors.laplace import Normal, laplace, likely_starts
 from cfx_posteriors.population import Population, fit_population
+
+if TYPE_CHECKING:
+    from cfx_posteriors.nuts import Chains
 
 _SHARES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
 
@@ -37,13 +41,7 @@ _WORK = 10**8
 """Vehicle steps that belong together: enough for a compiled kernel."""
 
 
-_OF_DRIVERS = (
-    "noise_scale",
-    "noise_correlation",
-    "noise_left",
-    "effective_samples",
-    "pareto_k",
-)
+_OF_DRIVERS = ("noise_scale", "noise_correlation", "noise_left", "effective_samples")
 
 
 @dataclass(frozen=True)
@@ -60,8 +58,9 @@ class ParameterIntervals(DriverPosteriors):
         noise_left: `(P,)`, the same correlation of what the noise's model leaves of it; near 0
             where the model is right.
         effective_samples: `(P,)`, effective sample size that the quantiles rest on.
-        pareto_k: `(P,)`, above 0.7 the intervals are not to be relied on.
-        draws: parameters, `(P, DRAWS, n)`, SI units: as correlated as a recording leaves them.
+        diagnostics: whether the intervals are to be relied on, columns of `fits`, `(P,)` each.
+        draws: parameters, `(P, draws, n)`, SI units: as correlated as a recording leaves them.
+        chains: that the draws are of, one after the other; 1 where draws are independent.
         make_fan: simulates the fan of trajectories.
         origin: where drivers who were not recorded come from: the population, or as the prior has
             them.
@@ -77,8 +76,9 @@ class ParameterIntervals(DriverPosteriors):
     noise_correlation: Tensor
     noise_left: Tensor
     effective_samples: Tensor
-    pareto_k: Tensor
+    diagnostics: Mapping[str, Tensor]
     draws: Tensor
+    chains: int
     make_fan: Callable[[], Fan]
     origin: Population | PriorDrivers
     seed: int
@@ -91,6 +91,8 @@ class ParameterIntervals(DriverPosteriors):
                 found[f"{kind}_{name}"] = getattr(self, kind)[:, number].numpy()
         for kind in _OF_DRIVERS:
             found[kind] = getattr(self, kind).numpy()
+        for kind, values in self.diagnostics.items():
+            found[kind] = values.numpy()
         return found
 
     def tables(self, ids: Sequence[str]) -> dict[str, pd.DataFrame]:
@@ -102,7 +104,11 @@ class ParameterIntervals(DriverPosteriors):
         pairs, draws, _ = self.draws.shape
         values = pd.DataFrame(self.draws.flatten(0, 1).numpy(), columns=columns)
         values.insert(0, "pair_id", np.repeat(np.asarray(ids, dtype=object), draws))
-        values.insert(1, "draw", np.tile(np.arange(draws), pairs))
+        if self.chains > 1:
+            chain = np.repeat(np.arange(self.chains), draws // self.chains)
+            values.insert(1, "chain", np.tile(chain, pairs))
+        draw = np.tile(np.arange(draws // self.chains), pairs * self.chains)
+        values.insert(len(values.columns) - len(columns), "draw", draw)
         new = pd.DataFrame(self.draw_drivers(NEW_DRIVERS, self.seed).numpy(), columns=columns)
         name = "population" if isinstance(self.origin, Population) else "prior"
         return {"posterior": values, "fan": self.make_fan().table(ids), name: new}
@@ -143,7 +149,30 @@ class LaplaceMethod(PosteriorMethod):
         posterior = posterior_of(solver, batch, last, settings)
         origin = PriorDrivers(solver.space, posterior.prior)
         normal = laplace(posterior, _starts(solver, posterior, best))
-        return _intervals(solver, batch, last, settings, (posterior, normal, origin))
+        sampled = _sampled(solver, posterior, normal)
+        return _intervals(solver, batch, last, settings, (posterior, normal, origin, sampled))
+
+
+class NutsMethod(PosteriorMethod):
+    """Each driver alone: chains of the No-U-Turn sampler, which start from weighted samples."""
+
+    def find(
+        self,
+        solver: Solver,
+        batch: PairBatch,
+        last: Tensor,
+        best: Tensor,
+        settings: CalibrationSettings,
+    ) -> ParameterIntervals:
+        # JAX is imported by those alone who ask for chains.
+        from cfx_posteriors.nuts import walk
+
+        posterior = posterior_of(solver, batch, last, settings)
+        origin = PriorDrivers(solver.space, posterior.prior)
+        normal = laplace(posterior, _starts(solver, posterior, best))
+        sampled = _sampled(solver, posterior, normal)
+        chains = walk(posterior, sampled, _shares(), seed=solver.seed, memory=solver.memory)
+        return _intervals(solver, batch, last, settings, (posterior, normal, origin, chains))
 
 
 class HierarchicalMethod(PosteriorMethod):
@@ -161,7 +190,8 @@ class HierarchicalMethod(PosteriorMethod):
     ) -> ParameterIntervals:
         alone = posterior_of(solver, batch, last, settings)
         population, posterior, normal = fit_population(alone, _starts(solver, alone, best))
-        return _intervals(solver, batch, last, settings, (posterior, normal, population))
+        sampled = _sampled(solver, posterior, normal)
+        return _intervals(solver, batch, last, settings, (posterior, normal, population, sampled))
 
 
 def _starts(solver: Solver, posterior: Posterior, best: Tensor) -> Tensor:
@@ -173,23 +203,31 @@ def _starts(solver: Solver, posterior: Posterior, best: Tensor) -> Tensor:
     return torch.cat([best[:, None], default[:, None], likely], dim=1)
 
 
+def _shares() -> Tensor:
+    return torch.tensor(_SHARES, dtype=torch.float64)
+
+
+def _sampled(solver: Solver, posterior: Posterior, normal: Normal) -> Sampled:
+    return sample(posterior, normal, _shares(), seed=solver.seed, memory=solver.memory)
+
+
 def _intervals(
     solver: Solver,
     batch: PairBatch,
     last: Tensor,
     settings: CalibrationSettings,
-    found: tuple[Posterior, Normal, Population | PriorDrivers],
+    found: tuple[Posterior, Normal, Population | PriorDrivers, Sampled | Chains],
 ) -> ParameterIntervals:
     """Returns the intervals of each driver's parameters.
 
     Args:
         solver, batch, last, settings: as of `PosteriorMethod.find`.
-        found: the posteriors, Laplace's approximation of them, and where new drivers come from.
+        found: the posteriors, Laplace's approximation of them, where new drivers come from, and
+            samples.
     """
-    posterior, normal, origin = found
+    posterior, normal, origin, sampled = found
     space = solver.space
-    shares = torch.tensor(_SHARES, dtype=torch.float64)
-    sampled = sample(posterior, normal, shares, seed=solver.seed, memory=solver.memory)
+    shares = _shares()
     prior = posterior.prior.quantiles(shares, len(space))
     width = (sampled.quantiles[:, 2] - sampled.quantiles[:, 0]) / (prior[2] - prior[0])
     values = space.from_unit(torch.sigmoid(sampled.quantiles))
@@ -201,7 +239,7 @@ def _intervals(
         return fan_of(
             replace(whole, stride=posterior.stride),
             last.cpu(),
-            sampled.draws,
+            sampled.draws[:, :: sampled.draws.shape[1] // DRAWS],
             shares,
             seed=solver.seed,
             memory=solver.memory,
@@ -217,8 +255,9 @@ def _intervals(
         noise_correlation=correlation,
         noise_left=left,
         effective_samples=sampled.effective,
-        pareto_k=sampled.pareto_k,
+        diagnostics=sampled.diagnostics,
         draws=space.from_unit(torch.sigmoid(sampled.draws[..., : len(space)])),
+        chains=sampled.chains,
         make_fan=make_fan,
         origin=origin,
         seed=solver.seed,

@@ -19,15 +19,12 @@ import torch
 from torch import Tensor
 
 from cfx_posteriors import noise
-from cfx_posteriors.density import Posterior
+from cfx_posteriors.density import DIFFERENCE, Posterior
 
 _SPREAD, _LIKELY = 256, 3
 """Places all over the prior that are tried, and as many of them as searches start from."""
 
 _ROUNDS = 60
-_DIFFERENCE = 1e-5
-"""Distance in a logit over which slopes are measured."""
-
 _DAMPING, _LEAST_DAMPING, _MOST_DAMPING = 1e-2, 1e-9, 1e4
 _LONGEST = 1.5
 """Longest step in one coordinate."""
@@ -187,11 +184,11 @@ def _around(posterior: Posterior, place: Tensor) -> _Around:
     n, order = len(posterior.space), posterior.order
     drivers, searches, d = place.shape
     logits = place[..., :n]
-    shift = _DIFFERENCE * torch.eye(n, dtype=place.dtype, device=place.device)
+    shift = DIFFERENCE * torch.eye(n, dtype=place.dtype, device=place.device)
     asked = torch.cat([logits[:, :, None], logits[:, :, None] + shift], dim=2)
     errors = posterior.errors(asked.flatten(1, 2)).view(-1, drivers, searches, 1 + n)
     middle = errors[..., 0]
-    slopes = (errors[..., 1:] - errors[..., :1]) / _DIFFERENCE
+    slopes = (errors[..., 1:] - errors[..., :1]) / DIFFERENCE
     products = noise.lagged_products(middle, posterior.counted, order)
     value = noise.log_density(products, posterior.count, place[..., n:])
     value = value + posterior.prior.log_density(logits)

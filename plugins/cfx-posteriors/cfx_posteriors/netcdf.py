@@ -1,7 +1,7 @@
 """`cfx export --to netcdf`: a job's posteriors as ArviZ and other programs read them.
 
-The file follows ArviZ's InferenceData: groups of labelled arrays, with a chain and a draw. Draws
-are independent, so there is one chain.
+The file follows ArviZ's InferenceData: groups of labelled arrays, with a chain and a draw. Weighted
+samples are one chain, since they are independent.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from typing import cast
 import numpy as np
 import pandas as pd
 import xarray as xr
+from numpy.typing import NDArray
 
 from cfx import DrivingModel
 from cfx.core.command import ExportFormat
@@ -29,6 +30,8 @@ NAME = "posterior.nc"
 _PARAMETER = "parameter_"
 _DIAGNOSTICS = {
     "pareto_k": "above 0.7 a driver's draws are not to be relied on",
+    "r_hat": "above 1.05 a driver's chains differ",
+    "divergences": "share of the draws; above 0.01 chains may have left out a part",
     "effective_samples": "effective sample size that the draws rest on",
     "noise_scale": "what each step of the noise adds",
     "noise_correlation": "of the noise with itself one step later",
@@ -52,7 +55,7 @@ class NetcdfExport(ExportFormat):
         if "posterior" not in tables or "fits" not in tables:
             raise DataError(
                 f"{run}: this job has found no posterior; run one with"
-                " calibration.posterior=laplace or hierarchical"
+                " calibration.posterior=laplace, nuts or hierarchical"
             )
         node = read_yaml(folder / "config.yaml")["model"]
         tree = inference_data(tables, cast(DrivingModel, create("model", node)))
@@ -63,8 +66,8 @@ class NetcdfExport(ExportFormat):
         write_output(output, content, "the posterior")
         sizes = tree["posterior"].sizes
         return [
-            f"{output}: {sizes['draw']} draws for each of {sizes['pair']} pairs, groups"
-            f" {', '.join(tree.children)}",
+            f"{output}: {sizes['chain'] * sizes['draw']} draws for each of {sizes['pair']} pairs,"
+            f" groups {', '.join(tree.children)}",
             f'Read it: xarray.open_datatree("{output}"); ArviZ takes what that returns',
         ]
 
@@ -90,6 +93,8 @@ def inference_data(tables: Mapping[str, pd.DataFrame], model: DrivingModel) -> x
     rows = tables["fits"].query("method == 'fixed'").set_index("pair_id").loc[pairs]
     diagnostics = {}
     for name, meaning in _DIAGNOSTICS.items():
+        if name not in rows:
+            continue
         diagnostics[name] = ("pair", rows[name].to_numpy(np.float64), {"long_name": meaning})
     groups["diagnostics"] = xr.Dataset(diagnostics, coords={"pair": pairs})
     return xr.DataTree.from_dict(groups)
@@ -99,17 +104,23 @@ def _dataset(
     table: pd.DataFrame, names: Sequence[str], model: DrivingModel, pairs: Sequence[str] | None
 ) -> xr.Dataset:
     """Returns draws of parameters, of some pairs or of nobody in particular."""
-    dims = ("chain", "draw") if pairs is None else ("chain", "draw", "pair")
+    # A pair stands after the other, each with its chains, and they with their draws.
+    chains = table["chain"].nunique() if "chain" in table else 1
+    dims: tuple[str, ...] = ("chain", "draw")
+    if pairs is not None:
+        dims = (*dims, "pair")
     variables = {}
     for name in names:
-        # A pair stands after the other, each with its draws.
-        values = table[name].to_numpy(np.float64).reshape(1 if pairs is None else len(pairs), -1)
-        values = values if pairs is None else values.T[None]
+        values: NDArray[np.float64] = table[name].to_numpy(np.float64)
+        if pairs is None:
+            values = values.reshape(chains, -1)
+        else:
+            values = np.moveaxis(values.reshape(len(pairs), chains, -1), 0, -1)
         parameter = model.space[name.removeprefix(_PARAMETER)]
         about = {"units": parameter.unit, "long_name": parameter.meaning}
         variables[parameter.name] = (dims, values, about)
-    draws = len(table) // (1 if pairs is None else len(pairs))
-    coords: dict[str, object] = {"chain": [0], "draw": np.arange(draws)}
+    draws = len(table) // (chains if pairs is None else chains * len(pairs))
+    coords: dict[str, object] = {"chain": np.arange(chains), "draw": np.arange(draws)}
     if pairs is not None:
         coords["pair"] = list(pairs)
     return xr.Dataset(variables, coords=coords)

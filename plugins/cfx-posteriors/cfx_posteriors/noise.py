@@ -84,11 +84,17 @@ def prior_log_density(noise: Tensor) -> Tensor:
 
     It leaves constants out. Partial autocorrelations are uniform.
     """
-    squashed, log_scale = noise[..., :-1], noise[..., -1]
+    log_scale = noise[..., -1]
+    uniform = uniform_log_density(noise[..., :-1])
+    found: Tensor = uniform - 2.0 * SHAPE * log_scale - RATE * torch.exp(-2.0 * log_scale)
+    return found
+
+
+def uniform_log_density(squashed: Tensor) -> Tensor:
+    """Returns the log density of squashed partial autocorrelations `(*batch, m)` a priori."""
     # log(1 - tanh(x)^2) without cancellation.
     size = squashed.abs()
-    uniform = 2.0 * (math.log(2.0) - size - softplus(-2.0 * size)).sum(-1)
-    found: Tensor = uniform - 2.0 * SHAPE * log_scale - RATE * torch.exp(-2.0 * log_scale)
+    found: Tensor = 2.0 * (math.log(2.0) - size - softplus(-2.0 * size)).sum(-1)
     return found
 
 
@@ -100,23 +106,48 @@ def draw(count: int, order: int, generator: torch.Generator) -> Tensor:
     return torch.cat([torch.atanh(2.0 * uniform[:, :-1] - 1.0), 0.5 * (RATE / gamma).log()], dim=-1)
 
 
+def scale_gamma(products: Tensor, count: Tensor, squashed: Tensor) -> tuple[Tensor, Tensor]:
+    """Returns shape and rate of the gamma distribution that 1 / s^2 has, `(*batch,)` each.
+
+    Given errors and correlations.
+
+    Args:
+        products: of `lagged_products`, `(*batch, m + 1, m + 1)`.
+        count: steps that count, broadcasting to `(*batch,)`.
+        squashed: `(*batch, m)`, as in `coefficients`.
+    """
+    phi = coefficients(squashed)
+    whole = torch.cat([torch.ones_like(phi[..., :1]), -phi], dim=-1)
+    squares = (whole[..., :, None] * products * whole[..., None, :]).sum((-2, -1))
+    return 0.5 * count + SHAPE, 0.5 * squares + RATE
+
+
 def log_density(products: Tensor, count: Tensor, noise: Tensor) -> Tensor:
     """Returns the log density of errors and of the noise's parameters, `(*batch,)`.
 
     It leaves constants out.
 
     Args:
-        products: of `lagged_products`, `(*batch, m + 1, m + 1)`.
-        count: steps that count, broadcasting to `(*batch,)`.
+        products, count: as of `scale_gamma`.
         noise: `(*batch, m + 1)`, as in `coefficients`, then the logarithm of s.
     """
     squashed, log_scale = noise[..., :-1], noise[..., -1]
-    phi = coefficients(squashed)
-    whole = torch.cat([torch.ones_like(phi[..., :1]), -phi], dim=-1)
-    squares = (whole[..., :, None] * products * whole[..., None, :]).sum((-2, -1))
-    precision = torch.exp(-2.0 * log_scale)
-    likelihood = -count * log_scale - 0.5 * squares * precision
-    total = likelihood + prior_log_density(noise)
+    shape, rate = scale_gamma(products, count, squashed)
+    total = uniform_log_density(squashed) - 2.0 * shape * log_scale
+    total = total - rate * torch.exp(-2.0 * log_scale)
+    return torch.where(total.isfinite(), total, _LEAST_DENSITY)
+
+
+def marginal_log_density(products: Tensor, count: Tensor, squashed: Tensor) -> Tensor:
+    """Returns the log density of errors and correlations, whatever s, `(*batch,)`.
+
+    The integral of `log_density` over the logarithm of s, up to a constant.
+
+    Args:
+        products, count, squashed: as of `scale_gamma`.
+    """
+    shape, rate = scale_gamma(products, count, squashed)
+    total = uniform_log_density(squashed) - shape * rate.log()
     return torch.where(total.isfinite(), total, _LEAST_DENSITY)
 
 
@@ -124,15 +155,11 @@ def first_noise(products: Tensor, count: Tensor) -> Tensor:
     """Returns noise that fits errors roughly: where a search starts, `(*batch, m + 1)`.
 
     Args:
-        products: of `lagged_products`, `(*batch, m + 1, m + 1)`.
-        count: steps that count, broadcasting to `(*batch,)`.
+        products, count: as of `scale_gamma`.
     """
     order = products.shape[-1] - 1
     correlation = products[..., 0, 1] / products[..., 1, 1].clamp(min=1e-12)
     squashed = products.new_zeros((*products.shape[:-2], order))
     squashed[..., 0] = torch.atanh(correlation.clamp(-0.95, 0.999))
-    phi = coefficients(squashed)
-    whole = torch.cat([torch.ones_like(phi[..., :1]), -phi], dim=-1)
-    squares = (whole[..., :, None] * products * whole[..., None, :]).sum((-2, -1))
-    variance = (squares + 2.0 * RATE) / (count + 2.0 * SHAPE)
-    return torch.cat([squashed, 0.5 * variance.log()[..., None]], dim=-1)
+    shape, rate = scale_gamma(products, count, squashed)
+    return torch.cat([squashed, 0.5 * (rate / shape).log()[..., None]], dim=-1)

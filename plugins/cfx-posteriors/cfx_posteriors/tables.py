@@ -17,7 +17,8 @@ class PosteriorDraws(ResultTable):
     order = 211
     columns = (
         PAIR,
-        Column("draw", "1", "its number within the pair", "int"),
+        Column("chain", "1", "that the draw is of (`nuts`)", "int", required=False),
+        Column("draw", "1", "its number within the pair, or the chain", "int"),
         Column("parameter_NAME", "as of the parameter", "the parameter"),
     )
 
@@ -38,7 +39,7 @@ class PriorDraws(ResultTable):
 
     meaning = (
         "parameters as likely as they are before a driver's recording is seen"
-        " (`calibration.posterior=laplace`)"
+        " (`calibration.posterior=laplace`, `nuts`)"
     )
     order = 213
     columns = (Column("parameter_NAME", "as of the parameter", "the parameter"),)

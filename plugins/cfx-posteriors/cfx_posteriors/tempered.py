@@ -4,8 +4,7 @@ Samples of the prior come to the posterior step by step: the likelihood counts w
 rises from 0 to 1 as fast as half of the samples stay effective. After each rise samples are drawn
 anew by their weights and moved by Metropolis's steps: normal ones, as wide and as correlated as the
 samples, and differences of two other samples, which lead from one mode to another. Neither slopes
-nor a mode are needed, so densities that jump do no harm. Samplers of libraries (blackjax) want the
-density as a graph of theirs; ours is a compiled simulation of all samples.
+nor a mode are needed, so densities that jump do no harm.
 
 P. Del Moral, A. Doucet and A. Jasra (2006), *Sequential Monte Carlo samplers*, Journal of the Royal
 Statistical Society B 68(3). C. J. F. ter Braak (2006), *A Markov chain Monte Carlo version of the

@@ -31,7 +31,7 @@ from tests.report.folders import write_job
 
 
 def _known(results: Results) -> dict[str, float]:
-    known = {"pareto_k": 0.3}
+    known = {"pareto_k": 0.3, "effective_samples": 400.0}
     for axis in results.parameters:
         known |= {f"low_{axis.name}": 1.0, f"median_{axis.name}": 2.0, f"high_{axis.name}": 3.0}
         known[f"contraction_{axis.name}"] = 0.5

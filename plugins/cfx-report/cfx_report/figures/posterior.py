@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.calibration.levels import DETERMINED, LEVEL, RELIABLE
+from cfx.calibration.levels import DETERMINED, LEVEL, reliable
 from cfx.figures.canvas import canvas, legend_above, most_across, points, styled, wrapped
 from cfx.figures.figure import JobFigure, ParameterAxis, Results
 from cfx.figures.text import EDGE, INK, colour_of, plural, short, unit_label
@@ -30,9 +30,9 @@ _BEFORE, _AFTER = "before the recording", "after the recording"
 
 def interval_rows(fits: pd.DataFrame) -> pd.DataFrame:
     """Returns the rows of a job's table `fits` that have intervals."""
-    if "pareto_k" not in fits:
+    if "effective_samples" not in fits:
         return fits.iloc[:0]
-    return fits[(fits["method"] == "fixed") & fits["pareto_k"].notna()]
+    return fits[(fits["method"] == "fixed") & fits["effective_samples"].notna()]
 
 
 @styled
@@ -67,9 +67,9 @@ def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
 def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
     ordered = rows.sort_values(f"median_{axis.name}")
     number = np.arange(len(ordered))
-    reliable = ordered["pareto_k"].to_numpy(dtype=float) <= RELIABLE
+    good = reliable(ordered).to_numpy(dtype=bool)
     known = ordered[f"contraction_{axis.name}"].to_numpy(dtype=float) >= DETERMINED
-    kinds = (reliable & known, reliable & ~known, ~reliable)
+    kinds = (good & known, good & ~known, ~good)
     low, middle, high = (
         ordered[f"{kind}_{axis.name}"].to_numpy(dtype=float) for kind in ("low", "median", "high")
     )
@@ -90,7 +90,7 @@ def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
         for bound in (axis.low, axis.high):
             place.axhline(bound, color=EDGE, linestyle="--", linewidth=1)
     place.set_xticks([])
-    share = int((reliable & known).sum())
+    share = int((good & known).sum())
     place.set_title(f"{unit_label(axis.name, axis.unit)}: {share} of {len(ordered)}")
 
 

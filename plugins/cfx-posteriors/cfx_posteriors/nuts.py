@@ -1,0 +1,350 @@
+"""Chains that follow the density's slope: blackjax's No-U-Turn sampler, all drivers in step.
+
+A step of all chains of all drivers is one simulation: every chain takes it with those whose trees
+have not turned back yet, and the density is a call from JAX into the compiled kernel. Slopes are
+differences, which any model has; a sampler of this kind needs none that are exact, since its steps
+can be turned around and keep volumes with any force that the place alone determines. Chains run,
+and start, in coordinates in which the weighted samples (`importance`) are about standard normal:
+what is left to learn is the length of a step. The scale of the noise is no coordinate of theirs:
+its distribution given the others is known, and without it densities fall less steeply.
+
+M. D. Hoffman and A. Gelman (2014), *The No-U-Turn sampler*, Journal of Machine Learning Research
+15. A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Bürkner (2021), *Rank-normalization,
+folding, and localization: an improved R-hat*, Bayesian Analysis 16(2).
+
+Shapes: P drivers, C chains, n tuned parameters, d coordinates, e = d - 1 without the noise's scale.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import blackjax
+import jax
+import jax.numpy as jnp
+import numpy as np
+import torch
+from arviz_stats.base.array import array_stats
+from blackjax.adaptation.step_size import DualAveragingAdaptationState, dual_averaging_adaptation
+from blackjax.mcmc.hmc import HMCState
+from blackjax.mcmc.nuts import NUTSInfo
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator
+from torch import Tensor
+
+from cfx_posteriors.density import Posterior
+from cfx_posteriors.importance import Sampled
+
+CHAINS = 4
+WARM_UP, DRAWS = 200, 500
+"""Draws of each chain: those that find coordinates and the length of a step, and those kept."""
+
+_AT_ONCE = 25
+"""Draws between which Python may be interrupted."""
+
+_QUICKLY = {"xla_backend_optimization_level": 0}
+"""Compiles in 3 instead of 6 s; what JAX has to do beside the simulations is little."""
+
+_FIRST_LENGTH = 0.5
+"""Of a step, in standard deviations."""
+
+_ACCEPTED = 0.8
+"""Acceptance that the length of a step aims at."""
+
+_DOUBLINGS = 7
+"""Of a tree, at most: 127 steps."""
+
+_SHARES = (0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99)
+"""Of samples, at which a coordinate is that of a normal distribution."""
+
+_FAR = 6.0
+"""Deviations to which a coordinate is a line from the outermost two of these on."""
+
+_LEAST_RISE = 0.02
+"""Of a coordinate for each of its normal scores, in standard deviations."""
+
+
+class Chains(NamedTuple):
+    """Chains of P drivers.
+
+    Attributes:
+        quantiles: of each parameter's logit, `(P, shares, n)`.
+        draws: of all coordinates, a chain after the other, `(P, C * DRAWS, d)`.
+        effective: effective sample size (ArviZ; in the middle and in the tails), of the coordinate
+            with the least, `(P,)`.
+        r_hat: of the coordinate with the largest, `(P,)`.
+        divergences: share of the draws whose trees ended where energy is not kept, `(P,)`.
+    """
+
+    quantiles: Tensor
+    draws: Tensor
+    effective: Tensor
+    r_hat: Tensor
+    divergences: Tensor
+
+    @property
+    def chains(self) -> int:
+        """C."""
+        return CHAINS
+
+    @property
+    def diagnostics(self) -> dict[str, Tensor]:
+        """What says how far to trust them, `(P,)` each."""
+        return {"r_hat": self.r_hat, "divergences": self.divergences}
+
+
+class _Walk(NamedTuple):
+    """Where chains stand, `(P, C, ...)`, and what is known of the length of a step, `(P,)`."""
+
+    state: HMCState
+    length: DualAveragingAdaptationState
+
+
+class _Step(NamedTuple):
+    """One draw of each chain, `(P, C, ...)`."""
+
+    place: jax.Array | NDArray[np.float64]
+    diverges: jax.Array | NDArray[np.bool_]
+
+
+class _Coordinates:
+    """Coordinates in which samples are about standard normal: a Gaussian copula of them.
+
+    A posterior may end like a wall, as that of a desired speed does at the highest speed that was
+    driven. Where a coordinate alone is normal it does not, and steps may be longer.
+    """
+
+    def __init__(self, sampled: Tensor) -> None:
+        """Takes quantiles and correlations of samples `(P, N, e)`."""
+        count = sampled.shape[1]
+        score = torch.special.ndtri((torch.arange(count, dtype=torch.float64) + 0.5) / count)
+        order = sampled.argsort(dim=1).argsort(dim=1)
+        identity = torch.eye(sampled.shape[2], dtype=torch.float64)
+        scores = score[order]
+        self.factor = torch.linalg.cholesky(scores.mT @ scores / count + 1e-3 * identity)
+
+        shares = torch.tensor(_SHARES, dtype=torch.float64)
+        inside = torch.special.ndtri(shares)
+        deviation = sampled.std(dim=1).clamp(min=1e-9)
+        known = sampled.quantile(shares, dim=1)
+        # Samples may be the same, and a coordinate has to rise all the same.
+        known = known + _LEAST_RISE * inside[:, None, None] * deviation
+        low = (known[1] - known[0]) / (inside[1] - inside[0])
+        high = (known[-1] - known[-2]) / (inside[-1] - inside[-2])
+        far = [known[0] - (_FAR + inside[0]) * low], [known[-1] + (_FAR - inside[-1]) * high]
+        places = torch.stack([*far[0], *known, *far[1]])
+        self.knots = torch.cat([inside.new_tensor([-_FAR]), inside, inside.new_tensor([_FAR])])
+        cubic = PchipInterpolator(self.knots.numpy(), places.numpy())
+        self.cubic = torch.from_numpy(cubic.c).permute(2, 0, 3, 1)
+
+    def relearned(self, sampled: Tensor, seen: Tensor) -> _Coordinates:
+        """Returns coordinates of samples `(P, N, e)` and of what chains saw in these `(P, M, e)`.
+
+        Chains find tails that weighted samples have missed.
+        """
+        places, *_ = self.outer(seen)
+        return _Coordinates(torch.cat([sampled, places], dim=1))
+
+    def outer(self, places: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Returns places in these coordinates `(P, q, e)` as the posterior has them.
+
+        Two derivatives by the normal scores of each coordinate come with them.
+        """
+        scores = places @ self.factor.mT
+        between = torch.bucketize(scores, self.knots[1:-1])
+        away = scores - self.knots[between]
+        cubic = self.cubic[..., None, :, :].expand(-1, -1, scores.shape[1], -1, -1)
+        number = between[:, None, ..., None].expand(-1, 4, -1, -1, 1)
+        c3, c2, c1, c0 = cubic.gather(-1, number)[..., 0].unbind(1)
+        place = ((c3 * away + c2) * away + c1) * away + c0
+        return place, (3.0 * c3 * away + 2.0 * c2) * away + c1, 6.0 * c3 * away + 2.0 * c2
+
+    def density(self, posterior: Posterior, places: Tensor, drivers: Tensor) -> Tensor:
+        """Returns log density and slope `(S, q, 1 + e)` of some drivers.
+
+        Args:
+            posterior: of these drivers.
+            places: of all drivers, in these coordinates, `(P, q, e)`.
+            drivers: numbers of these, `(S,)`.
+        """
+        place, rate, bend = (values[drivers] for values in self.outer(places))
+        value, slope = posterior.with_slope(place)
+        slope = (slope * rate + bend / rate) @ self.factor[drivers]
+        value = value + rate.log().sum(-1)
+        return torch.cat([value[..., None], slope], dim=-1).nan_to_num()
+
+
+class _Density:
+    """The log density and its slope, as JAX calls them.
+
+    It calls from a thread of its own, in which values of 64 bits would become such of 32: they come
+    and go as two halves.
+    """
+
+    def __init__(self, posterior: Posterior, coordinates: _Coordinates) -> None:
+        self.posterior = posterior
+        drivers, e = posterior.segments.problems, posterior.dimensions - 1
+        self.last = torch.empty((drivers, CHAINS, e), dtype=torch.float64)
+        self.change(coordinates)
+        self.answer = torch.zeros((drivers, CHAINS, 1 + e), dtype=torch.float64)
+        self.driving, self.part = torch.arange(drivers), posterior
+
+    def change(self, coordinates: _Coordinates) -> None:
+        """Takes other coordinates, in which nothing has been asked for yet."""
+        self.coordinates = coordinates
+        self.last.fill_(torch.nan)
+
+    def __call__(self, halves: jax.Array) -> NDArray[np.uint32]:
+        """Returns log density and slope `(P, C, 1 + e)` at places `(P, C, e)`.
+
+        A driver all of whose trees are finished asks for the same places again, while others go on:
+        they are not simulated.
+        """
+        places = torch.from_numpy(np.array(halves).view(np.float64)[..., 0])
+        moved = (places != self.last).flatten(1).any(1).nonzero()[:, 0]
+        if len(moved):
+            if not torch.equal(moved, self.driving):
+                self.driving, self.part = moved, self.posterior.take(moved)
+            self.answer[moved] = self.coordinates.density(self.part, places, moved)
+            self.last.copy_(places)
+        return self.answer.numpy()[..., None].view(np.uint32)
+
+    def of_chain(self, place: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Returns the log density and its slope at the place of one chain `(e,)`, for JAX."""
+        like = jax.ShapeDtypeStruct((1 + len(place), 2), jnp.uint32)  # type: ignore[no-untyped-call]  # it has no types
+        halves = jax.lax.bitcast_convert_type(place, jnp.uint32)
+        answer = jax.pure_callback(self, like, halves, vmap_method="broadcast_all")
+        both = jax.lax.bitcast_convert_type(answer, jnp.float64)
+        return both[0], both[1:]
+
+
+def walk(
+    posterior: Posterior, sampled: Sampled, shares: Tensor, *, seed: int, memory: int
+) -> Chains:
+    """Returns chains of each driver's posterior.
+
+    Args:
+        posterior: of P drivers.
+        sampled: samples of it, which chains start from.
+        shares: of the quantiles, within (0, 1).
+        seed: the same seed gives the same chains.
+        memory: bound in bytes for the drivers that are worked on at once.
+    """
+    n, d = len(posterior.space), posterior.dimensions
+    kept = 4 * CHAINS * DRAWS * (d + 4) * torch.float64.itemsize
+    at_once = max(CHAINS * (n + 1), DRAWS)
+    size = max(1, memory // (at_once * posterior.bytes_per_candidate + kept))
+    parts = []
+    for drivers in torch.split(torch.arange(len(sampled.draws)), size):
+        places, diverges = _walked(posterior.take(drivers), sampled.draws[drivers], seed)
+        effective = torch.from_numpy(effective_samples(places.numpy()))
+        r_hat = array_stats.rhat(places.numpy(), chain_axis=1, draw_axis=2).max(-1)
+        draws = places.flatten(1, 2)
+        parts.append(
+            Chains(
+                draws[..., :n].quantile(shares, dim=1).transpose(0, 1),
+                draws,
+                effective,
+                torch.from_numpy(r_hat),
+                diverges.double().mean((1, 2)),
+            )
+        )
+    return Chains(*(torch.cat(values) for values in zip(*parts, strict=True)))
+
+
+def effective_samples(chains: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Returns the effective sample size of the coordinate with the least, `(P,)`.
+
+    Args:
+        chains: `(P, C, draws, d)`.
+    """
+    found = array_stats.ess(chains, chain_axis=1, draw_axis=2)
+    tails = array_stats.ess(chains, chain_axis=1, draw_axis=2, method="tail", prob=(0.05, 0.95))
+    least: NDArray[np.float64] = np.minimum(found, tails).min(-1)
+    return least
+
+
+def _walked(posterior: Posterior, sampled: Tensor, seed: int) -> tuple[Tensor, Tensor]:
+    """Returns draws `(P, CHAINS, DRAWS, d)`, and whether their trees diverged.
+
+    Args:
+        posterior: of P drivers.
+        sampled: equally likely samples of it, `(P, N, d)`.
+        seed: of the chains.
+    """
+    sampled = sampled[..., :-1]
+    density = _Density(posterior, _Coordinates(sampled))
+    generator = torch.Generator().manual_seed(seed)
+    shape = (len(sampled), CHAINS, sampled.shape[2])
+    starts = torch.randn(shape, generator=generator, dtype=torch.float64).numpy()
+    key = jax.random.key(seed)
+    half, learning, every = (
+        draws // _AT_ONCE for draws in (WARM_UP // 2, WARM_UP, WARM_UP + DRAWS)
+    )
+    found: list[_Step] = []
+    with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
+        begin, go_on = _sampler(density)
+        now = begin(starts)
+        for number in range(every):
+            if number == half:
+                seen = torch.tensor(found[-1].place).flatten(1, 2)
+                density.change(density.coordinates.relearned(sampled, seen))
+                now = begin(starts)
+            keys = jax.random.split(jax.random.fold_in(key, number), (shape[0], _AT_ONCE, CHAINS))
+            now, steps = go_on(keys, now, number < learning)
+            found.append(_Step(*map(np.asarray, steps)))
+    coordinates = density.coordinates
+    # Draws come before chains.
+    places, diverges = (
+        torch.from_numpy(np.concatenate(values, axis=1)).transpose(1, 2)
+        for values in zip(*found[learning:], strict=True)
+    )
+    outer, *_ = coordinates.outer(places.flatten(1, 2))
+    drawn = []
+    for chain in torch.split(outer, DRAWS, dim=1):
+        drawn.append(torch.cat([chain, posterior.draw_scales(chain, generator)], dim=-1))
+    return torch.stack(drawn, dim=1), diverges
+
+
+def _sampler(density: _Density) -> tuple[Callable[..., _Walk], Callable[..., tuple[_Walk, _Step]]]:
+    """Returns what begins walks of all drivers, and what goes on with them."""
+
+    @jax.custom_vjp
+    def log_density(place: jax.Array) -> jax.Array:
+        return density.of_chain(place)[0]
+
+    log_density.defvjp(density.of_chain, lambda slope, weight: (weight * slope,))
+    kernel = blackjax.nuts.build_kernel()
+    first, learned, _ = dual_averaging_adaptation(_ACCEPTED)
+
+    def begin(starts: jax.Array) -> _Walk:
+        state = jax.vmap(lambda start: blackjax.nuts.init(start, log_density))(starts)
+        # All of one type from the beginning on, so that JAX compiles once.
+        length = jax.tree.map(lambda value: jnp.asarray(value, jnp.float64), first(_FIRST_LENGTH))
+        return _Walk(state, length)
+
+    def go_on(keys: jax.Array, walk: _Walk, learning: jax.Array) -> tuple[_Walk, _Step]:
+        identity = jnp.eye(walk.state.position.shape[-1])
+
+        def step(walk: _Walk, keys: jax.Array) -> tuple[_Walk, _Step]:
+            known = walk.length
+            length = jnp.exp(jnp.where(learning, known.log_step_size, known.log_step_size_avg))
+
+            def of_chain(key: jax.Array, state: HMCState) -> tuple[HMCState, NUTSInfo]:
+                drawn: tuple[HMCState, NUTSInfo] = kernel(
+                    key, state, log_density, length, identity, _DOUBLINGS
+                )
+                return drawn
+
+            state, said = jax.vmap(of_chain)(keys, walk.state)
+            more = learned(known, said.acceptance_rate.mean())
+            kept = jax.tree.map(lambda new, old: jnp.where(learning, new, old), more, known)
+            return _Walk(state, kept), _Step(state.position, said.is_divergent)
+
+        found: tuple[_Walk, _Step] = jax.lax.scan(step, walk, keys)
+        return found
+
+    compiled = functools.partial(jax.jit, compiler_options=_QUICKLY)
+    return compiled(jax.vmap(begin)), compiled(jax.vmap(go_on, in_axes=(0, 0, None)))
