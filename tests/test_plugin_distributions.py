@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import configparser
+import os
 import re
 import subprocess
 import sys
@@ -128,6 +129,36 @@ def wheels(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     )
     assert done.returncode == 0, done.stderr
     return {path.name.split("-")[0].replace("_", "-"): path for path in folder.glob("*.whl")}
+
+
+@pytest.mark.slow
+def test_the_examples_of_drivers_elsewhere_run_from_wheels(
+    wheels: dict[str, Path], tmp_path: Path
+) -> None:
+    """ONNX, FMI, Gymnasium and highway-env; the graph and the unit drive the same follower."""
+    site, work = tmp_path / "site", tmp_path / "work"
+    work.mkdir()
+    build = [sys.executable, "-c", BUILD, tmp_path, ROOT]
+    subprocess.run(build, capture_output=True, check=True)
+    for wheel in (*wheels.values(), *tmp_path.glob("cfx_driving-*.whl")):
+        with zipfile.ZipFile(wheel) as archive:
+            archive.extractall(site)
+    example = ROOT / "plugins" / "cfx-onnx" / "examples" / "platoon.py"
+    done = subprocess.run(
+        [sys.executable, ROOT / "tests" / "driver_examples.py", example],
+        cwd=work,
+        env={**os.environ, "PYTHONPATH": str(site)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    packages = done.stdout.splitlines()[0].split()
+    assert len(packages) == 4
+    assert all(Path(package).parent == site for package in packages)
+    apart = re.search(r"unit apart (\S+) m/s", done.stdout)
+    assert apart is not None
+    assert float(apart[1]) < 1e-6
 
 
 def test_there_are_plugins_and_no_other_folders() -> None:
