@@ -17,25 +17,34 @@ Shapes: P drivers, C chains, n tuned parameters, d coordinates, e = d - 1 withou
 
 from __future__ import annotations
 
+import contextlib
 import functools
+import sys
 from collections.abc import Callable
 from typing import NamedTuple
 
-import blackjax
-import jax
-import jax.numpy as jnp
 import numpy as np
 import torch
 from arviz_stats.base.array import array_stats
-from blackjax.adaptation.step_size import DualAveragingAdaptationState, dual_averaging_adaptation
-from blackjax.mcmc.hmc import HMCState
-from blackjax.mcmc.nuts import NUTSInfo
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from cfx_posteriors.density import Posterior
 from cfx_posteriors.importance import Sampled
+
+# JAX brings absl, whose handler of logging keeps the standard error of its import, and closes it
+# as logging is configured anew, unless it is the process's own.
+with contextlib.redirect_stderr(sys.__stderr__):
+    import blackjax
+    import jax
+    import jax.numpy as jnp
+    from blackjax.adaptation.step_size import (
+        DualAveragingAdaptationState,
+        dual_averaging_adaptation,
+    )
+    from blackjax.mcmc.hmc import HMCState
+    from blackjax.mcmc.nuts import NUTSInfo
 
 CHAINS = 4
 WARM_UP, DRAWS = 200, 500
