@@ -92,7 +92,10 @@ class ValidRange:
             network: whose range each is compared with, `(D,)`.
         """
         away = situation.to(self.mean) - self.mean[network]
-        squared = torch.einsum("di,dij,dj->d", away, self.precision[network], away)
+        # Two at a time: of three PyTorch asks opt_einsum, where that is installed, for an order,
+        # with which an exported graph would keep the number of its drivers.
+        turned = torch.einsum("di,dij->dj", away, self.precision[network])
+        squared = torch.einsum("dj,dj->d", turned, away)
         return squared.clamp(min=0.0).sqrt() / self.distance[network]
 
     def beyond(self, situation: Tensor, network: Tensor) -> Tensor:
