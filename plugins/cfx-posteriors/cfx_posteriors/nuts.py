@@ -47,7 +47,7 @@ with contextlib.redirect_stderr(sys.__stderr__):
     from blackjax.mcmc.nuts import NUTSInfo
 
 CHAINS = 4
-WARM_UP, DRAWS = 200, 500
+WARM_UP, DRAWS = 200, 800
 """Draws of each chain: those that find coordinates and the length of a step, and those kept."""
 
 _AT_ONCE = 25
