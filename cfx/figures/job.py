@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
@@ -36,6 +36,7 @@ from cfx.evaluation.tables import scope_label
 from cfx.figures.figure import ParameterAxis, Results
 from cfx.figures.text import TEST
 from cfx.results.table import file_of, installed, read_tables
+from cfx.results.tracker import Origin
 from cfx.simulation.trajectory import TRANSIENT_S
 
 OUTSIDE = "outside_range"
@@ -353,17 +354,6 @@ class Job:
             gap=gap,
             parameters=parameters,
         )
-
-
-@dataclass(frozen=True)
-class Origin:
-    """What is known of a job besides its files: of a tracked one, from MLflow."""
-
-    place: str
-    started: datetime | None = None
-    seconds: float | None = None
-    version: str = ""
-    hydra: Path | None = field(default=None)
 
 
 def improvement_column(baseline: str) -> str:

@@ -56,13 +56,11 @@ class Tracker:
 
 
 @dataclass(frozen=True)
-class TrackedJob:
-    """A job as its run tells it.
+class Origin:
+    """What is known of a job besides its files: of a tracked one, from its run.
 
     Attributes:
         place: what people know it by, such as "MLflow run 0a1b...".
-        folder: with its files; None: it did not finish.
-        reason: why it did not.
         started: when.
         seconds: how long it took, s; None: nobody knows.
         version: of cfx.
@@ -70,12 +68,25 @@ class TrackedJob:
     """
 
     place: str
-    folder: Path | None = None
-    reason: str = ""
     started: datetime | None = None
     seconds: float | None = None
     version: str = ""
     hydra: Path | None = None
+
+
+@dataclass(frozen=True)
+class TrackedJob:
+    """A job as its run tells it.
+
+    Attributes:
+        origin: which job.
+        folder: with its files; None: it did not finish.
+        reason: why it did not.
+    """
+
+    origin: Origin
+    folder: Path | None = None
+    reason: str = ""
 
 
 class Tracking(ABC):
@@ -178,12 +189,10 @@ def tracking_of_run(text: str) -> Tracking:
     Raises:
         TrackingError: no tracking is installed.
     """
-    names = registry.names("tracker")
-    for name in names:
-        tracking = tracking_named(name)
-        if tracking.is_run_id(text):
-            return tracking
-    if MLFLOW not in names:
+    tracking = _whose_run(text)
+    if tracking is not None:
+        return tracking
+    if MLFLOW not in registry.names("tracker"):
         raise TrackingError(
             f"'{text}' is no job's output folder; to name a job by its run in MLflow:"
             f" {install_line('cfx-mlflow')}"
@@ -193,7 +202,16 @@ def tracking_of_run(text: str) -> Tracking:
 
 def is_run_id(text: str) -> bool:
     """Says whether this could be the id of a run of an installed tracking."""
-    return any(tracking_named(name).is_run_id(text) for name in registry.names("tracker"))
+    return _whose_run(text) is not None
+
+
+def _whose_run(text: str) -> Tracking | None:
+    """Returns the first installed tracking of whose runs this could be the id; None: of none."""
+    for name in registry.names("tracker"):
+        tracking = tracking_named(name)
+        if tracking.is_run_id(text):
+            return tracking
+    return None
 
 
 def folder_of(folder_or_run: str | Path, uri: str | None = None) -> Path:

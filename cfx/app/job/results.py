@@ -23,7 +23,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
 from cfx.results.table import Findings, read_tables
-from cfx.results.tracker import folder_of
+from cfx.results.tracker import Origin, folder_of
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -145,7 +145,7 @@ class JobResult:
     def _results(self) -> Results:
         """What figures are drawn from."""
         from cfx.figures.figure import Results
-        from cfx.figures.job import Origin, read_job
+        from cfx.figures.job import read_job
 
         if self.computed is None:
             assert self.folder is not None

@@ -149,30 +149,22 @@ class LaplaceMethod(PosteriorMethod):
         posterior = posterior_of(solver, batch, last, settings)
         origin = PriorDrivers(solver.space, posterior.prior)
         normal = laplace(posterior, _starts(solver, posterior, best))
-        sampled = _sampled(solver, posterior, normal)
-        return _intervals(solver, batch, last, settings, (posterior, normal, origin, sampled))
+        found = self.draws_of(solver, posterior, _sampled(solver, posterior, normal))
+        return _intervals(solver, batch, last, settings, (posterior, normal, origin, found))
+
+    def draws_of(self, solver: Solver, posterior: Posterior, sampled: Sampled) -> Sampled | Chains:
+        """Returns the draws that stand for the posterior, of weighted samples of it."""
+        return sampled
 
 
-class NutsMethod(PosteriorMethod):
+class NutsMethod(LaplaceMethod):
     """Each driver alone: chains of the No-U-Turn sampler, which start from weighted samples."""
 
-    def find(
-        self,
-        solver: Solver,
-        batch: PairBatch,
-        last: Tensor,
-        best: Tensor,
-        settings: CalibrationSettings,
-    ) -> ParameterIntervals:
+    def draws_of(self, solver: Solver, posterior: Posterior, sampled: Sampled) -> Sampled | Chains:
         # JAX is imported by those alone who ask for chains.
         from cfx_posteriors.nuts import walk
 
-        posterior = posterior_of(solver, batch, last, settings)
-        origin = PriorDrivers(solver.space, posterior.prior)
-        normal = laplace(posterior, _starts(solver, posterior, best))
-        sampled = _sampled(solver, posterior, normal)
-        chains = walk(posterior, sampled, _shares(), seed=solver.seed, memory=solver.memory)
-        return _intervals(solver, batch, last, settings, (posterior, normal, origin, chains))
+        return walk(posterior, sampled, _shares(), seed=solver.seed, memory=solver.memory)
 
 
 class HierarchicalMethod(PosteriorMethod):

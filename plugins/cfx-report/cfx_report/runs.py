@@ -17,8 +17,8 @@ from cfx.core.job_folder import (
     without_password,
 )
 from cfx.core.storage import is_url, local_folder
-from cfx.figures.job import Job, Origin, read_job
-from cfx.results.tracker import tracking_of_run
+from cfx.figures.job import Job, read_job
+from cfx.results.tracker import Origin, tracking_of_run
 from cfx_report.jobs import Runs, Unfinished
 from cfx_report.names import named
 
@@ -32,10 +32,9 @@ def tracked_runs(run_id: str) -> list[tuple[Path, Origin] | Unfinished]:
     found: list[tuple[Path, Origin] | Unfinished] = []
     for job in tracking_of_run(run_id).jobs_of_run(run_id):
         if job.folder is None:
-            found.append(Unfinished(job.place, job.reason))
+            found.append(Unfinished(job.origin.place, job.reason))
         else:
-            origin = Origin(job.place, job.started, job.seconds, job.version, job.hydra)
-            found.append((job.folder, origin))
+            found.append((job.folder, job.origin))
     return found
 
 
