@@ -146,6 +146,10 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
             ["data=tidy", "data.path=x.csv", "data.columns={pairid: trip}"],
             "'data.columns.pairid'. Did you mean 'data.columns.pair_id'? Known keys of",
         ),
+        (
+            ["experiment=every_road", "data.site={A*: A}"],
+            "To replace all of them: '~data.site' '+data.site={A*: A}'",
+        ),
         (["modle=w99", "policy=nope"], "policy=nope: there is no policy 'nope'."),
         (["seed=-1"], "seed=-1: should be greater than or equal to 0."),
         (["+sede=1"], "sede: unknown key. Did you mean 'seed'?"),

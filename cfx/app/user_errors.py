@@ -111,9 +111,13 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
         config: Any = hydra_source.composed(others)
     except Exception:  # the other overrides may be wrong too; the sentence is then without advice
         return f"{given}: there is no key '{key}'; cfx --cfg job prints every key"
-    inner = _unknown_name(given, OmegaConf.select(config, key))
+    inner, whole = _unknown_name(given, OmegaConf.select(config, key))
     if inner:
-        return _unknown_key(f"{key}.{inner}", others)
+        sentence = _unknown_key(f"{key}.{inner}", others)
+        if whole and "Did you mean" not in sentence:
+            value = given.partition("=")[2]
+            sentence += f" To replace all of them: '~{key}' '+{key}={value}'"
+        return sentence
     parent, _, last = key.rpartition(".")
     siblings = config
     if parent:
@@ -134,13 +138,17 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     return f"{given}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
 
 
-def _unknown_name(override: str, node: object) -> str:
-    """Returns the first name in an override's mapping that a node does not have; "" without one."""
+def _unknown_name(override: str, node: object) -> tuple[str, bool]:
+    """Returns the first name of an override's mapping that a node lacks; whether it lacks all.
+
+    "" stands for no such name.
+    """
     if not isinstance(node, DictConfig):
-        return ""
+        return "", False
     value = OverridesParser.create().parse_override(override).value()
-    names = value if isinstance(value, dict) else ()
-    return next((str(name) for name in names if str(name) not in node), "")
+    names = [str(name) for name in value] if isinstance(value, dict) else []
+    unknown = [name for name in names if name not in node]
+    return next(iter(unknown), ""), len(unknown) == len(names)
 
 
 def _options_with(group: str, setting: str, chosen: str) -> str:
