@@ -29,10 +29,10 @@ if TYPE_CHECKING:
     from cfx.app.application import run as run
     from cfx.app.job import JobResult as JobResult
     from cfx.app.job import load as load
-    from cfx.calibration.objectives.base import FrameValues as FrameValues
-    from cfx.calibration.objectives.base import Objective as Objective
-    from cfx.calibration.optimizers.base import CandidateLosses as CandidateLosses
-    from cfx.calibration.optimizers.base import Optimizer as Optimizer
+    from cfx.calibration.objectives import FrameValues as FrameValues
+    from cfx.calibration.objectives import Objective as Objective
+    from cfx.calibration.optimizers import CandidateLosses as CandidateLosses
+    from cfx.calibration.optimizers import Optimizer as Optimizer
     from cfx.core import errors as errors
     from cfx.core.command import Command as Command
     from cfx.core.component import API_VERSION as API_VERSION
@@ -66,9 +66,9 @@ if TYPE_CHECKING:
     from cfx.results.table import Column as Column
     from cfx.results.table import Findings as Findings
     from cfx.results.table import ResultTable as ResultTable
+    from cfx.simulation.base import Simulator as Simulator
+    from cfx.simulation.base import SimulatorSettings as SimulatorSettings
     from cfx.simulation.base import Stepper as Stepper
-    from cfx.simulation.simulator import Simulator as Simulator
-    from cfx.simulation.simulator import SimulatorSettings as SimulatorSettings
     from cfx.simulation.trajectory import Start as Start
 
     __version__: str
@@ -99,14 +99,14 @@ _HOMES = {
     "ModelSettings": "cfx.models.base",
     "bumper_gap": "cfx.models.base",
     "Start": "cfx.simulation.trajectory",
-    "Simulator": "cfx.simulation.simulator",
-    "SimulatorSettings": "cfx.simulation.simulator",
+    "Simulator": "cfx.simulation.base",
+    "SimulatorSettings": "cfx.simulation.base",
     "Stepper": "cfx.simulation.base",
     "Engine": "cfx.core.engine",
-    "Optimizer": "cfx.calibration.optimizers.base",
-    "CandidateLosses": "cfx.calibration.optimizers.base",
-    "Objective": "cfx.calibration.objectives.base",
-    "FrameValues": "cfx.calibration.objectives.base",
+    "Optimizer": "cfx.calibration.optimizers",
+    "CandidateLosses": "cfx.calibration.optimizers",
+    "Objective": "cfx.calibration.objectives",
+    "FrameValues": "cfx.calibration.objectives",
     "Policy": "cfx.policies.base",
     "PolicySettings": "cfx.policies.base",
     "PolicyNetwork": "cfx.policies.base",

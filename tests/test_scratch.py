@@ -22,7 +22,7 @@ from cfx.data.base import joined, scaled
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.resample import resampled
 from cfx.data.tidy import read_tidy, write_tidy
-from cfx.evaluation import evaluate, result, shards
+from cfx.evaluation import closed_loop, evaluate, result
 from cfx.simulation.synthetic import SyntheticDataset
 
 JOB = (
@@ -154,7 +154,7 @@ def test_a_job_in_files_and_in_parts_has_the_same_results(
     overrides = (*JOB, "data.max_pairs=6", "data.frames=200", f"protocol={protocol}")
     expected = cfx.run([*overrides, "hydra.run.dir=whole"])
     monkeypatch.setattr(scratch, "LARGE", 1)
-    for module in (shards, evaluate):
+    for module in (closed_loop, evaluate):
         monkeypatch.setattr(module, "PAIRS_AT_ONCE", 4)
     for module, name in ((result, "_PAIRS_AT_ONCE"), (style, "_PAIRS_AT_ONCE")):
         monkeypatch.setattr(module, name, 4)

@@ -216,9 +216,8 @@ class Fit:
         import torch
 
         from cfx.calibration.identifiability import training_errors
-        from cfx.evaluation.closed_loop import Followers
+        from cfx.evaluation.closed_loop import Followers, simulate_in_shards
         from cfx.evaluation.evaluate import closed_loop_errors
-        from cfx.evaluation.shards import simulate_in_shards
         from cfx.policies.fixed import FixedPolicy
 
         context, parameters = self._context, self._tensor(method)

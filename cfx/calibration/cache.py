@@ -59,26 +59,20 @@ class Cache:
     """
 
     def __init__(self, folder: Path | str | None) -> None:
-        self.folder: Path | None = None
-        self._remote: RemoteFolder | None = None
-        if isinstance(folder, str):
-            self._remote = RemoteFolder(folder)
-        else:
-            self.folder = folder
+        self.folder = None if isinstance(folder, str) else folder
+        self._remote = RemoteFolder(folder) if isinstance(folder, str) else None
 
     def get(self, key: str) -> Arrays | None:
         """Returns the entry, or None if there is none or it is damaged."""
-        if self._remote is not None:
-            return self._remote_entry(self._remote, key)
-        path = self._path(key)
-        if path is None or not path.is_file():
-            return None
         try:
-            content = _content(path)
-            with np.load(io.BytesIO(content), allow_pickle=False) as archive:
+            whole = self._read(key)
+            if whole is None:
+                return None
+            with np.load(io.BytesIO(_checked(whole)), allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
         except (OSError, ValueError, zipfile.BadZipFile, EOFError):
-            log.warning("The cached calibration %s is damaged; it is computed again.", path)
+            where = key if self.folder is None else self.folder / _name(key)
+            log.warning("The cached calibration %s is damaged; it is computed again.", where)
             return None
 
     def put(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -87,8 +81,7 @@ class Cache:
         Raises:
             OutputError: the folder cannot be written.
         """
-        path = self._path(key)
-        if path is None and self._remote is None:
+        if self.folder is None and self._remote is None:
             return
         archive = io.BytesIO()
         # NumPy's stubs take every name for `allow_pickle`.
@@ -98,31 +91,29 @@ class Cache:
         try:
             if self._remote is not None:
                 self._remote.write(_name(key), whole)
-            if path is not None:
+            elif self.folder is not None:
+                path = self.folder / _name(key)
                 path.parent.mkdir(parents=True, exist_ok=True)
                 with atomic_write(path) as temporary:
                     temporary.write_bytes(whole)
         except OSError as error:
             raise self._unwritable(error) from error
 
-    def _remote_entry(self, remote: RemoteFolder, key: str) -> Arrays | None:
-        """Returns an entry behind a URL, or None.
-
-        Raises:
-            OutputError: the store cannot be read.
-        """
-        try:
-            whole = remote.read(_name(key))
-        except OSError as error:
-            raise self._unwritable(error) from error
-        if whole is None:
+    def _read(self, key: str) -> bytes | None:
+        """Returns an entry as it lies in its folder, or None if there is none."""
+        if self._remote is not None:
+            try:
+                return self._remote.read(_name(key))
+            except OSError as error:
+                raise self._unwritable(error) from error
+        if self.folder is None:
             return None
-        try:
-            with np.load(io.BytesIO(_checked(whole)), allow_pickle=False) as archive:
-                return {name: archive[name] for name in archive.files}
-        except (ValueError, zipfile.BadZipFile, EOFError):
-            log.warning("The cached calibration %s is damaged; it is computed again.", key)
+        path = self.folder / _name(key)
+        if not path.is_file():
             return None
+        if path.stat().st_size > _LARGEST:
+            raise ValueError("larger than any entry")
+        return path.read_bytes()
 
     def shares(self, keys: Sequence[str], scope: str) -> dict[str, list[int]]:
         """Returns the parts in which entries are claimed: the part's name -> positions in `keys`.
@@ -135,9 +126,7 @@ class Cache:
         """
         parts: dict[str, list[int]] = {}
         for position, key in enumerate(keys):
-            share = 0
-            if self.folder is not None:
-                share = int(key[:8], 16) % _SHARES
+            share = 0 if self.folder is None else int(key[:8], 16) % _SHARES
             # Three digits: there are never more than 4096 lock files, however many calibrations the
             # cache sees.
             name = hashlib.sha256(f"{scope} {share}".encode()).hexdigest()[:3]
@@ -180,12 +169,9 @@ class Cache:
         if self.folder is None:
             return True
         lock = lock_for(self.folder / "claims" / f"{name}.lock")
-        timeout = 0
-        if wait:
-            timeout = -1
         try:
             Path(lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
-            held.enter_context(lock.acquire(timeout=timeout, poll_interval=_POLL_S))
+            held.enter_context(lock.acquire(timeout=-1 if wait else 0, poll_interval=_POLL_S))
         except Timeout:
             return False
         except OSError as error:
@@ -193,18 +179,11 @@ class Cache:
         return True
 
     def _unwritable(self, error: OSError) -> OutputError:
-        where: Path | str | None = self.folder
-        if self._remote is not None:
-            where = self._remote.url
+        where = self.folder if self._remote is None else self._remote.url
         return OutputError(
             f"cannot write the calibration cache {where}: {error.strerror or error};"
             " set cache.folder to a folder that can be written, or cache.enabled=false"
         )
-
-    def _path(self, key: str) -> Path | None:
-        if self.folder is None:
-            return None
-        return self.folder / _name(key)
 
 
 def first_fit(sizes: Mapping[str, int], enough: int) -> list[list[str]]:
@@ -237,18 +216,6 @@ def _name(key: str) -> str:
 def _head(content: bytes) -> bytes:
     """Returns the line before an archive."""
     return _MARK + hashlib.sha256(content).hexdigest().encode() + b"\n"
-
-
-def _content(path: Path) -> bytes:
-    """Returns the archive of an entry whose checksum is right.
-
-    Raises:
-        ValueError: it is not.
-        OSError: the file cannot be read.
-    """
-    if path.stat().st_size > _LARGEST:
-        raise ValueError("larger than any entry")
-    return _checked(path.read_bytes())
 
 
 def _checked(whole: bytes) -> bytes:

@@ -7,6 +7,7 @@ where it stopped.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
@@ -20,15 +21,8 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.cache import Arrays, Cache, first_fit
-from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives.base import Objective
-from cfx.calibration.shards import (
-    CalibrationShard,
-    DriverShard,
-    PooledShard,
-    Solver,
-    WindowShard,
-)
+from cfx.calibration.objectives import Objective
+from cfx.calibration.shards import CalibrationShard, PooledShard, SegmentShard, Solver
 from cfx.core import scratch
 from cfx.core.component import content_key
 from cfx.core.engine import Engine
@@ -142,9 +136,7 @@ class Calibrator:
         self.cache = cache
         self.progress = progress
         self.reported = reported or {}
-        self.engine: Engine = LocalEngine()
-        if engine is not None:
-            self.engine = engine
+        self.engine = engine or LocalEngine()
 
     @property
     def space(self) -> ParameterSpace:
@@ -178,10 +170,18 @@ class Calibrator:
 
         compiled = self._has_kernel(batch)
 
-        def shard(chosen: Tensor, group: Tensor) -> DriverShard:
+        def shard(chosen: Tensor, group: Tensor) -> SegmentShard:
             chosen = chosen.to(device)
             solver = self._solver_for(len(group) * int(last[group].max()))
-            return DriverShard(solver, self._code, compiled, batch[chosen].trimmed(), last[chosen])
+            return SegmentShard(
+                solver,
+                self._code,
+                compiled,
+                batch[chosen].trimmed(),
+                pair=torch.arange(len(chosen), device=device),
+                first=torch.zeros_like(last[chosen]),
+                steps=last[chosen],
+            )
 
         title = "Driver-specific parameters"
         results = self._cached(title, keys, [1] * len(pairs), shard, part=_PART)
@@ -254,21 +254,22 @@ class Calibrator:
 
         compiled = self._has_kernel(batch)
 
-        def shard(chosen: Tensor, _group: Tensor) -> WindowShard:
+        def shard(chosen: Tensor, _group: Tensor) -> SegmentShard:
             pair, first, count = (values[chosen] for values in of_block)
             block = torch.arange(len(chosen)).repeat_interleave(count)
             number = torch.arange(len(block)) - (count.cumsum(0) - count)[block]
             used, place = torch.unique(pair, return_inverse=True)
             used = used.to(device)
-            return WindowShard(
+            start = ((first[block] + number) * windows.settings.stride).to(device)
+            return SegmentShard(
                 self.solver,
                 self._code,
                 compiled,
                 batch[used].trimmed(),
                 pair=place[block].to(device),
-                first=((first[block] + number) * windows.settings.stride).to(device),
+                first=start,
+                steps=torch.full_like(start, windows.settings.length),
                 counts=tuple(count.tolist()),
-                length=windows.settings.length,
                 guesses=guesses[used],
                 tolerance=tolerance,
             )
@@ -310,7 +311,7 @@ class Calibrator:
         means = dict.fromkeys(self.reported, 0.0)
         for part in torch.split(torch.arange(len(pair), device=device), size):
             own = pair[part]
-            losses = self._segments(batch, own, last[own])
+            losses = self.solver.segments(batch, own, torch.zeros_like(own), last[own])
             frames = losses.simulated(losses.parameters(unit[part]), gap=True)
             for name, objective in self.reported.items():
                 loss = objective(frames, losses.segments.counted[..., None])
@@ -318,39 +319,23 @@ class Calibrator:
             scratch.release()
         return means
 
-    def _segments(self, batch: PairBatch, pair: Tensor, last: Tensor) -> SegmentLosses:
-        """Returns the losses of pairs `(S,)` from their frame 0 to a last one `(S,)`."""
-        first = torch.zeros_like(pair)
-        return SegmentLosses.of_segments(
-            self.solver.simulator, self.solver.objective, batch, pair, first, last
-        )
-
     def _where_it_is_fast(self, batch: PairBatch) -> PairBatch:
         """Returns the pairs on the CPU if losses come from a compiled kernel there.
 
         On a GPU each step of a trajectory is a launch of its own: an H200 took twenty times as long
         for I-80's drivers as the kernel on 16 cores.
         """
-        if batch.lengths.device.type == "cpu":
-            return batch
-        if self._accumulates(batch[:1].to("cpu")):
+        if batch.lengths.device.type != "cpu" and self.solver.has_kernel(batch[:1].to("cpu")):
             return batch.to("cpu")
         return batch
 
     def _has_kernel(self, batch: PairBatch) -> bool:
         """Says whether losses come from a compiled kernel here; asked where others solve them."""
-        return self.engine.distributes and self._accumulates(batch)
-
-    def _accumulates(self, batch: PairBatch) -> bool:
-        """Says whether losses come from a compiled kernel where these pairs are."""
-        pair = torch.zeros(1, dtype=torch.int64, device=batch.lengths.device)
-        return self._segments(batch, pair, pair + 1).accumulates
+        return self.engine.distributes and self.solver.has_kernel(batch)
 
     @property
     def _prior_key(self) -> dict[str, float]:
-        if self.solver.prior == 0:
-            return {}
-        return {"prior": self.solver.prior}
+        return {"prior": self.solver.prior} if self.solver.prior else {}
 
     def _cached(
         self,
@@ -452,10 +437,7 @@ class _Work:
 
     def sizes(self, shares: Mapping[str, list[int]]) -> dict[str, int]:
         """Returns how many problems the entries of each share stand for."""
-        sizes = {}
-        for name, indices in shares.items():
-            sizes[name] = self._size(indices)
-        return sizes
+        return {name: self._size(indices) for name, indices in shares.items()}
 
     def parts(self, shares: dict[str, list[int]], task: Task) -> list[tuple[Tensor, Tensor]]:
         """Returns what is left of claimed shares: entries to solve, with the group they belong to.
@@ -465,10 +447,7 @@ class _Work:
         """
         parts = []
         for names in first_fit(self.sizes(shares), _GROUP):
-            indices: list[int] = []
-            for name in names:
-                indices += shares[name]
-            indices.sort()
+            indices = sorted(itertools.chain.from_iterable(shares[name] for name in names))
             for index in indices:
                 self._entries[index] = self._cache.get(self._keys[index])
             left = self._missing(indices)
@@ -489,10 +468,7 @@ class _Work:
         return [entry for entry in self._entries if entry is not None]
 
     def _size(self, indices: Sequence[int]) -> int:
-        total = 0
-        for index in indices:
-            total += self._problems[index]
-        return total
+        return sum(self._problems[index] for index in indices)
 
     def _missing(self, indices: Sequence[int]) -> list[int]:
         return [index for index in indices if self._entries[index] is None]

@@ -21,8 +21,7 @@ from torch import Tensor
 
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives.base import Objective
-from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
+from cfx.calibration.objectives import GapRmse, Objective, SpeedRmse
 from cfx.core import scratch
 from cfx.data.pairs import PairBatch
 

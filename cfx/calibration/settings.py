@@ -1,15 +1,38 @@
-"""Settings of calibration.
+"""Settings of calibration, and levels of what a posterior says.
 
-Imports no torch, so that a wrong configuration is answered at once.
+Imports no torch: a wrong configuration is answered at once, and results are read without.
 """
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import Field, model_validator
 
 from cfx.core.component import Settings
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+LEVEL = 0.9
+"""Probability of an interval."""
+
+DETERMINED = 0.3
+"""A recording determines a parameter where its interval is narrower than a priori by this share."""
+
+RELIABLE = 0.7
+"""Pareto k of weighted samples above which an interval is not to be relied on (Vehtari et al. 2024,
+*Pareto smoothed importance sampling*)."""
+
+MIXED = 1.05
+"""R-hat above which chains have not come to the same distribution."""
+
+DIVERGENT = 0.01
+"""Share of divergent draws above which chains may have left out a part of the posterior."""
+
+ENOUGH = 100.0
+"""Effective samples below which the ends of a 90 % interval move by a tenth of its width or so from
+one seed to the next (the 5 % point of a normal distribution: standard error 0.21 deviations)."""
 
 
 class CalibrationSettings(Settings):
@@ -47,3 +70,14 @@ class CalibrationSettings(Settings):
                         " leave it out, or set calibration.posterior=laplace"
                     )
         return self
+
+
+def reliable(rows: pd.DataFrame) -> pd.Series:
+    """Returns which drivers' intervals are to be relied on.
+
+    Args:
+        rows: of the table `fits`, with the diagnostics of weighted samples or of chains.
+    """
+    if "r_hat" in rows:
+        return (rows["r_hat"] <= MIXED) & (rows["divergences"] <= DIVERGENT)
+    return rows["pareto_k"] <= RELIABLE

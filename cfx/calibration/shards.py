@@ -16,11 +16,9 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.cache import Arrays
-from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
-from cfx.calibration.objectives.base import Objective
-from cfx.calibration.objectives.rmse import SpeedRmse
-from cfx.calibration.optimizers.base import Optimizer, Solution
-from cfx.calibration.prior import Prior
+from cfx.calibration.losses import FullTrajectories, PooledLosses, Prior, SegmentLosses
+from cfx.calibration.objectives import Objective, SpeedRmse
+from cfx.calibration.optimizers import Optimizer, Solution
 from cfx.core import registry
 from cfx.core.component import content_key, folder_hash
 from cfx.core.engine import Report, Unfit
@@ -51,7 +49,7 @@ class Solver:
         objective: what is minimised.
         memory: bound for one chunk, bytes.
         prior: weight of the prior on driver-specific and pooled parameters
-            (`cfx.calibration.prior`); 0: none. Labels have none: ties go to the driver's own set.
+            (`cfx.calibration.losses`); 0: none. Labels have none: ties go to the driver's own set.
     """
 
     simulator: Stepper
@@ -65,6 +63,17 @@ class Solver:
     def space(self) -> ParameterSpace:
         """The model's parameter space."""
         return self.simulator.model.space
+
+    def segments(
+        self, batch: PairBatch, pair: Tensor, first: Tensor, steps: Tensor
+    ) -> SegmentLosses:
+        """Returns the losses of segments of pairs; see `SegmentLosses.of_segments`."""
+        return SegmentLosses.of_segments(self.simulator, self.objective, batch, pair, first, steps)
+
+    def has_kernel(self, batch: PairBatch) -> bool:
+        """Says whether losses come from a compiled kernel where these pairs are."""
+        pair = torch.zeros(1, dtype=torch.int64, device=batch.lengths.device)
+        return self.segments(batch, pair, pair, pair + 1).accumulates
 
     @property
     def scope(self) -> dict[str, Any]:
@@ -189,18 +198,6 @@ class CalibrationShard:
     compiled: bool
     batch: PairBatch
 
-    def segments(self, pair: Tensor, first: Tensor, steps: Tensor) -> SegmentLosses:
-        """Returns the losses of segments `(S,)` of pairs, from a first frame on."""
-        return SegmentLosses.of_segments(
-            self.solver.simulator, self.solver.objective, self.batch, pair, first, steps
-        )
-
-    @property
-    def has_kernel(self) -> bool:
-        """Whether losses come from a compiled kernel here."""
-        pair = torch.zeros(1, dtype=torch.int64, device=self.batch.lengths.device)
-        return self.segments(pair, pair, pair + 1).accumulates
-
     def solve(self, report: Report) -> list[Arrays]:
         """Returns a cache entry for each request.
 
@@ -214,7 +211,7 @@ class CalibrationShard:
                 "a worker has other code than this job (another version of cfx or of a plugin);"
                 " install the same on all workers, and start them again"
             )
-        if self.compiled and not self.has_kernel:
+        if self.compiled and not self.solver.has_kernel(self.batch):
             raise Unfit(
                 "no kernel can be compiled there (no C++ compiler, or no place on the disk), so"
                 " that results would differ in their last bits"
@@ -235,18 +232,38 @@ class CalibrationShard:
 
 
 @dataclass(frozen=True)
-class DriverShard(CalibrationShard):
-    """Constant parameters of each pair.
+class SegmentShard(CalibrationShard):
+    """Constant parameters of each segment: of whole trajectories, or of windows.
 
     Attributes:
-        last: `(P,)`, the last frame that may be used of each.
+        pair, first, steps: `(W,)`, the pair of each segment, the frame that it starts from, and how
+            many steps it lasts.
+        counts: segments of each entry of the cache; None: one.
+        guesses: `(P, g, n)` in unit space, first guesses in each segment of a pair; None: the
+            model's defaults.
+        tolerance: losses this close are equal, in the objective's unit.
     """
 
-    last: Tensor
+    pair: Tensor
+    first: Tensor
+    steps: Tensor
+    counts: tuple[int, ...] | None = None
+    guesses: Tensor | None = None
+    tolerance: float = 0.0
 
     def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
-        pair = torch.arange(len(self.batch), device=self.last.device)
-        return self.segments(pair, torch.zeros_like(self.last), self.last), None, 0.0
+        losses = self.solver.segments(self.batch, self.pair, self.first, self.steps)
+        guesses = None if self.guesses is None else self.guesses[self.pair]
+        return losses, guesses, self.tolerance
+
+    def entries(self, found: Arrays) -> list[Arrays]:
+        if self.counts is None:
+            return super().entries(found)
+        entries = []
+        for last, count in zip(itertools.accumulate(self.counts), self.counts, strict=True):
+            own = slice(last - count, last)
+            entries.append({name: values[own] for name, values in found.items()})
+        return entries
 
 
 @dataclass(frozen=True)
@@ -265,38 +282,6 @@ class PooledShard(CalibrationShard):
         simulator, objective = self.solver.simulator, self.solver.objective
         trajectories = FullTrajectories(simulator, objective, self.batch, self.last)
         return PooledLosses(trajectories, self.members, self.solver.memory), None, 0.0
-
-
-@dataclass(frozen=True)
-class WindowShard(CalibrationShard):
-    """Parameters of each window.
-
-    Attributes:
-        pair, first: `(W,)`, the pair of each window and the frame that it starts from.
-        counts: windows of each entry of the cache.
-        length: steps of a window.
-        guesses: `(P, g, n)` in unit space, first guesses in each window of a pair.
-        tolerance: losses this close are equal, in the objective's unit.
-    """
-
-    pair: Tensor
-    first: Tensor
-    counts: tuple[int, ...]
-    length: int
-    guesses: Tensor
-    tolerance: float
-
-    def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
-        steps = torch.full_like(self.first, self.length)
-        losses = self.segments(self.pair, self.first, steps)
-        return losses, self.guesses[self.pair], self.tolerance
-
-    def entries(self, found: Arrays) -> list[Arrays]:
-        entries = []
-        for last, count in zip(itertools.accumulate(self.counts), self.counts, strict=True):
-            own = slice(last - count, last)
-            entries.append({name: values[own] for name, values in found.items()})
-        return entries
 
 
 def _towards(default: Tensor, losses: SegmentLosses | PooledLosses, best: Tensor) -> Tensor:

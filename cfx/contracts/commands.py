@@ -10,7 +10,7 @@ import sys
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.contracts import NotApplicable, contract_of
 
 if TYPE_CHECKING:
     from cfx.core.command import Command

@@ -7,7 +7,7 @@ from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from cfx.contracts.contract import contract_of
+from cfx.contracts import contract_of
 from cfx.core.errors import CfxError, DataError
 from cfx.data.base import Dataset, DatasetSettings
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet

@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
-from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.contracts import NotApplicable, contract_of
 from cfx.contracts.protocols import context
 from cfx.core.errors import CfxError, NotInstalledError
 from cfx.data.pairs import PairSet

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 
-from cfx.contracts.contract import contract_of
+from cfx.contracts import contract_of
 from cfx.core.engine import Engine, Report
 from cfx.core.errors import DataError
 

@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
-from cfx.contracts.contract import contract_of, expect_close
+from cfx.contracts import contract_of, expect_close
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingPairs, TrainingResult

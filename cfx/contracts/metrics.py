@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of, expect_close, expect_tensor
+from cfx.contracts import NotApplicable, contract_of, expect_close, expect_tensor
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.metrics.base import Metric, Trajectories
 

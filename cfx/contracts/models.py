@@ -11,7 +11,7 @@ from typing import Literal, get_args, get_origin
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of, expect_close, expect_tensor
+from cfx.contracts import NotApplicable, contract_of, expect_close, expect_tensor
 from cfx.core.errors import CfxError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.rollout import simulate

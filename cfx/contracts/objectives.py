@@ -10,8 +10,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from cfx.calibration.objectives.base import FrameValues, Objective
-from cfx.contracts.contract import contract_of, expect_close, expect_tensor
+from cfx.calibration.objectives import FrameValues, Objective
+from cfx.contracts import contract_of, expect_close, expect_tensor
 
 FRAMES, PROBLEMS, CANDIDATES = 12, 3, 4
 DT = 0.1

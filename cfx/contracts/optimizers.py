@@ -1,6 +1,6 @@
 """The contract of an optimizer, statement by statement.
 
-Shapes as in `cfx.calibration.optimizers.base`.
+Shapes as in `cfx.calibration.optimizers`.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cfx.calibration.optimizers.base import CandidateLosses, Optimizer, Solution
-from cfx.contracts.contract import NotApplicable, contract_of, expect_close
+from cfx.calibration.optimizers import CandidateLosses, Optimizer, Solution
+from cfx.contracts import NotApplicable, contract_of, expect_close
 from cfx.core.errors import PluginError
 
 Function = Callable[[Tensor, Tensor], Tensor]

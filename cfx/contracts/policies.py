@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import contract_of, expect_close, expect_tensor
+from cfx.contracts import contract_of, expect_close, expect_tensor
 from cfx.models.idm import IDM
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import token_width

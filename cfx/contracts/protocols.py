@@ -17,9 +17,9 @@ import torch
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.search import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.contracts.contract import NotApplicable, contract_of
+from cfx.contracts import NotApplicable, contract_of
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.data.style import StyleSettings, measure_style
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult

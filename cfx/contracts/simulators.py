@@ -14,7 +14,7 @@ from weakref import WeakKeyDictionary
 import torch
 from torch import Tensor
 
-from cfx.contracts.contract import NotApplicable, contract_of, expect_close, expect_tensor
+from cfx.contracts import NotApplicable, contract_of, expect_close, expect_tensor
 from cfx.core.errors import CfxError, ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm_sumo import IdmSumo
@@ -22,8 +22,7 @@ from cfx.models.krauss import Krauss
 from cfx.models.krauss_sumo import KraussSumo
 from cfx.models.w74 import W74
 from cfx.models.w99 import W99
-from cfx.simulation.base import Stepper
-from cfx.simulation.simulator import Simulator
+from cfx.simulation.base import Simulator, Stepper
 from cfx.simulation.trajectory import Start
 
 DT = 0.1

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cfx.contracts.contract import contract_of
+from cfx.contracts import contract_of
 from cfx.results.table import Column, ResultTable
 
 _EXAMPLES = {

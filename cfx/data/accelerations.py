@@ -32,7 +32,7 @@ _AHEAD_S = 1.0
 """How far ahead accelerations are to tell the speed."""
 
 _JERK_TIME_S, _MOST_JERK = 0.8, 5.0
-"""How a jerk is forgotten, and its bound, m/s3: as policies start (`cfx.models.residual`)."""
+"""How a jerk is forgotten, and its bound, m/s3: as policies start (`cfx.models.composed`)."""
 
 _LOOKED_AT_S = 60.0
 """Beginning of a pair from which the average is chosen."""

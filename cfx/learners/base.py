@@ -17,8 +17,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
-from cfx.calibration.objectives.base import Objective
-from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.calibration.objectives import Objective, SpeedRmse
 from cfx.core.component import Component
 from cfx.core.engine import Engine
 from cfx.core.errors import ConfigError

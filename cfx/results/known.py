@@ -9,7 +9,7 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from cfx.calibration.levels import DETERMINED, DIVERGENT, ENOUGH, LEVEL, MIXED, RELIABLE, reliable
+from cfx.calibration.settings import DETERMINED, DIVERGENT, ENOUGH, LEVEL, MIXED, RELIABLE, reliable
 from cfx.core.parameters import Parameter
 from cfx.results.table import Findings
 

@@ -1,4 +1,4 @@
-"""Base class of steppers, which take a model's steps for calibration, learning and evaluation."""
+"""The contract of a simulator: it says which driving models it can drive, and takes their steps."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar
 
+from pydantic import Field
 from torch import Tensor
 
+from cfx.core import registry
+from cfx.core.component import Component, Settings
 from cfx.core.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.trajectory import Segments, Start, Terms
 
 
@@ -61,53 +63,30 @@ class Stepper(ABC):
             CfxError: an input wants gradients, and `differentiable` is False.
         """
 
-    def accumulates(self, p: Mapping[str, Tensor], terms: Terms, key: ComponentKey | str) -> bool:
+    def accumulates(self, p: Mapping[str, Tensor], terms: Terms) -> bool:
         """Says whether `accumulate` sums up these terms, given enough work, without trajectories.
 
         Args:
             p: one tensor per parameter, as for `accumulate`; their number of candidates is nothing.
             terms: what a frame adds to each sum.
-            key: tells these terms from others.
         """
         return False
 
     def accumulate(
-        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: ComponentKey | str
+        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, every: int | None = None
     ) -> tuple[Tensor, ...] | None:
         """Simulates segments and sums up what their frames add, without keeping trajectories.
 
         Args:
             segments: P segments.
             p: one tensor per parameter, `()` or broadcasting to `(P, q)`.
-            terms: what a frame adds to each sum; a pure elementwise function.
-            key: tells these terms from others.
+            terms: what a frame adds to each sum.
+            every: the terms of each so many-th frame, instead of sums.
 
         Returns:
-            Each sum over the frames that count, `(P, q)`; None where trajectories have to be
-            simulated by `advance`.
-        """
-        return None
-
-    def frame_terms(
-        self,
-        segments: Segments,
-        p: Mapping[str, Tensor],
-        terms: Terms,
-        key: ComponentKey | str,
-        every: int,
-    ) -> tuple[Tensor, ...] | None:
-        """Simulates segments and returns what single frames add, not summed up.
-
-        Args:
-            segments: P segments.
-            p: as for `accumulate`.
-            terms: as for `accumulate`.
-            key: as for `accumulate`.
-            every: each so many-th frame is returned.
-
-        Returns:
-            Each term of frames `every`, `2 every` and so on, `(K // every, P, q)`, 0 where a frame
-            does not count; None where trajectories have to be simulated by `advance`.
+            Each sum over the frames that count, `(P, q)`, or each term of frames `every`,
+            `2 every` and so on, `(K // every, P, q)`, 0 where a frame does not count; None where
+            trajectories have to be simulated by `advance`.
         """
         return None
 
@@ -136,3 +115,57 @@ class Stepper(ABC):
     @abstractmethod
     def identity(self) -> str:
         """Returns what results depend on besides the model and the time step; caches carry it."""
+
+
+class SimulatorSettings(Settings):
+    """Settings that every simulator has."""
+
+    memory_mb: int = Field(
+        1024, ge=16, description="bound for what one chunk of calibration problems takes, MB"
+    )
+
+
+class Simulator(Component):
+    """Base of every simulator.
+
+    Life cycle: constructed once per job, before any work. `require` is asked first, and a job whose
+    driving model it refuses ends there; then `stepper` is called once, with the recordings' time
+    step. Constructing and `require` start nothing.
+
+    A subclass implements `stepper`. One that does not use the model's equations says in `require`
+    which models it can drive.
+
+    Attributes:
+        differentiable: gradients flow through the steps. Tested.
+    """
+
+    kind = "simulator"
+    schema: ClassVar[type[Settings]] = SimulatorSettings
+    settings: SimulatorSettings
+
+    differentiable: ClassVar[bool] = False
+
+    def require(self, model: DrivingModel) -> None:
+        """Checks that this simulator can drive a model; the base class asks for equations.
+
+        Raises:
+            ConfigError: it cannot; says what to choose.
+            CfxError: another one where something is not installed that the simulator needs.
+        """
+        if model.needs_simulator:
+            raise ConfigError(
+                f"model={registry.name_of(model)} has no equations in Python; add"
+                f" simulator={model.needs_simulator}, which alone drives it"
+            )
+
+    @abstractmethod
+    def stepper(self, model: DrivingModel, dt: float) -> Stepper:
+        """Returns what takes the steps of one model at one time step.
+
+        Args:
+            model: one that `require` lets through.
+            dt: time step, s.
+
+        Raises:
+            ConfigError: the simulator cannot drive the model, or not at this time step.
+        """

@@ -17,24 +17,31 @@ import itertools
 import math
 import shutil
 import sysconfig
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import torch
+from pydantic import Field
 from torch import Tensor
 
-from cfx.core.component import folder_hash
+from cfx.core.component import Settings, folder_hash
 from cfx.core.errors import ParameterError
 from cfx.core.guest import same_environment
 from cfx.core.threads import one_thread
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.simulation.base import Stepper
+from cfx.simulation.base import Simulator, SimulatorSettings, Stepper
 from cfx.simulation.kernel import run as kernel
 from cfx.simulation.kernel.compiler import torch_compiled
-from cfx.simulation.kernel.keys import ComponentKey
 from cfx.simulation.step import advance_vehicle
-from cfx.simulation.trajectory import Segments, Start, Terms, Trajectory, common_shape
+from cfx.simulation.trajectory import (
+    ComponentKey,
+    Segments,
+    Start,
+    Terms,
+    Trajectory,
+    common_shape,
+)
 
 Compile = Literal["auto", "always", "never"]
 _Parameters = dict[str, Tensor]
@@ -89,7 +96,7 @@ class MemoryStepper(Stepper):
         if steps == 0:
             nothing = follower.speed.new_empty((0, *batch))
             return follower, nothing, nothing
-        eager = _stepper(self.model, self.dt)
+        eager = _stepper(self.model, self.dt, steps)
         inputs = (*follower, *leader, *p.values())
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in inputs):
             return eager(follower, leader, dict(p))
@@ -114,54 +121,45 @@ class MemoryStepper(Stepper):
         *,
         compiled: bool,
     ) -> tuple[Follower, Tensor, Tensor]:
-        """As `advance`, a tile of at most `size` followers after the other."""
+        """As `advance`, a tile of at most `size` followers after the other.
+
+        Compiled steps go in blocks; what is left over goes step by step.
+        """
         steps, batch = len(leader.position), follower.speed.shape
-        end = Follower(
-            _empty_like(follower.position),
-            _empty_like(follower.speed),
-            _empty_like(follower.acceleration),
-            _empty_like(follower.memory),
-        )
+        contiguous = torch.contiguous_format
+        end = Follower(*(torch.empty_like(state, memory_format=contiguous) for state in follower))
         position = follower.speed.new_empty((steps, *batch))
         speed = follower.speed.new_empty((steps, *batch))
+        blocks = steps - steps % _BLOCK
         with one_thread():
             for tile in tiles(batch, size):
-                own, own_p = tile.follower(follower), tile.parameters(p)
+                last, own = tile.follower(follower), tile.parameters(p)
                 rows, speed_rows = tile.rows(position), tile.rows(speed)
+                cuts, make = [0, steps], _stepper
                 if compiled and len(tile) > 1:
-                    last = self._take_compiled(tile, own, leader, own_p, rows, speed_rows)
-                else:
-                    last = self._take_eager(tile, own, leader, own_p, rows, speed_rows)
+                    cuts = [*range(0, blocks, _BLOCK), *range(blocks, steps + 1)]
+                    make = _compiled_stepper
+                for first, until in itertools.pairwise(cuts):
+                    take = make(self.model, self.dt, until - first)
+                    last, positions, speeds = take(last, tile.leader(leader, first, until), own)
+                    rows[first:until].copy_(positions.view(-1, *tile.shape))
+                    speed_rows[first:until].copy_(speeds.view(-1, *tile.shape))
                 tile.write(end, last)
         return end, position, speed
 
-    def accumulates(self, p: Mapping[str, Tensor], terms: Terms, key: ComponentKey | str) -> bool:
+    def accumulates(self, p: Mapping[str, Tensor], terms: Terms) -> bool:
         if self._mode == "never" or next(iter(p.values())).device.type != "cpu":
             return False
-        return kernel.exists(self.model, self.dt, p, terms, key=key)
+        return kernel.exists(self.model, self.dt, p, terms)
 
     def accumulate(
-        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, key: ComponentKey | str
+        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, every: int | None = None
     ) -> tuple[Tensor, ...] | None:
         candidates = max(math.prod(value.shape[1:]) for value in p.values())
         steps = segments.counted.numel() * candidates
         if segments.speed.device.type != "cpu" or not self._pays(steps, _WORTH_A_KERNEL):
             return None
-        return kernel.accumulate(self.model, self.dt, segments, p, terms, key=key)
-
-    def frame_terms(
-        self,
-        segments: Segments,
-        p: Mapping[str, Tensor],
-        terms: Terms,
-        key: ComponentKey | str,
-        every: int,
-    ) -> tuple[Tensor, ...] | None:
-        candidates = max(math.prod(value.shape[1:]) for value in p.values())
-        steps = segments.counted.numel() * candidates
-        if segments.speed.device.type != "cpu" or not self._pays(steps, _WORTH_A_KERNEL):
-            return None
-        return kernel.accumulate(self.model, self.dt, segments, p, terms, key=key, every=every)
+        return kernel.accumulate(self.model, self.dt, segments, p, terms, every)
 
     def _compiles(self, steps: int, like: Tensor) -> bool:
         return self._pays(steps * like.numel(), _WORTH_COMPILING) and can_compile(like.device)
@@ -170,57 +168,31 @@ class MemoryStepper(Stepper):
         work = max(steps, self._together)
         return self._mode == "always" or (self._mode == "auto" and work >= worth)
 
-    def _take_eager(
-        self,
-        tile: Tile,
-        follower: Follower,
-        leader: Leader,
-        p: _Parameters,
-        position: Tensor,
-        speed: Tensor,
-    ) -> Follower:
-        """Takes all steps of one tile; writes positions and speeds `(time, rows, columns)`."""
-        take = _stepper(self.model, self.dt)
-        last, positions, speeds = take(follower, tile.leader(leader, 0, len(position)), p)
-        position.copy_(positions.view_as(position))
-        speed.copy_(speeds.view_as(speed))
-        return last
 
-    def _take_compiled(
-        self,
-        tile: Tile,
-        follower: Follower,
-        leader: Leader,
-        p: _Parameters,
-        position: Tensor,
-        speed: Tensor,
-    ) -> Follower:
-        """As `_take_eager`, in compiled blocks; what is left over goes step by step."""
-        steps = len(position)
-        blocks = steps - steps % _BLOCK
-        cuts = [*range(0, blocks, _BLOCK), *range(blocks, steps + 1)]
-        current = follower
-        for first, last in itertools.pairwise(cuts):
-            take = _compiled_stepper(self.model, self.dt, last - first)
-            current, positions, speeds = take(current, tile.leader(leader, first, last), p)
-            position[first:last].copy_(positions.view(-1, *tile.shape))
-            speed[first:last].copy_(speeds.view(-1, *tile.shape))
-        return current
+class MemorySettings(SimulatorSettings):
+    """Settings of `memory`."""
+
+    compile: Compile = Field("auto", description="compile the model's step: auto: where it pays")
 
 
-def _empty_like(state: Tensor) -> Tensor:
-    return torch.empty_like(state, memory_format=torch.contiguous_format)
+class MemorySimulator(Simulator):
+    """The model's own equations take the steps, for all followers at once."""
+
+    differentiable = True
+    schema: ClassVar[type[Settings]] = MemorySettings
+    settings: MemorySettings
+
+    def stepper(self, model: DrivingModel, dt: float) -> Stepper:
+        self.require(model)
+        return MemoryStepper(model, dt, compile=self.settings.compile)
 
 
-def _stepper(model: DrivingModel, dt: float) -> _Step:
-    """Returns the function that takes all steps of a leader's frames.
-
-    It is `advance` without its layout.
-    """
+def _stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
+    """Returns the function that takes some steps: `advance` without its layout."""
 
     def take(follower: Follower, leader: Leader, p: _Parameters) -> tuple[Follower, Tensor, Tensor]:
         positions, speeds = [], []
-        for k in range(leader.position.shape[0]):
+        for k in range(steps):
             now = Leader(leader.position[k], leader.speed[k], leader.acceleration[k], leader.length)
             follower = advance_vehicle(model, follower, now, p, dt)
             positions.append(follower.position)
@@ -239,7 +211,7 @@ def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     if key not in _COMPILED:
         # Each model and block has a cache of its own: torch counts recompilations per function, and
         # gives up after eight.
-        take = _stepper(model, dt)
+        take = _stepper(model, dt, steps)
         _COMPILED[key] = torch_compiled(take, dynamic=True, isolate_recompiles=True)
     return _COMPILED[key]
 
@@ -257,15 +229,6 @@ def can_compile(device: torch.device) -> bool:
     if not Path(sysconfig.get_path("include"), "Python.h").is_file():
         return False
     return any(shutil.which(name) for name in ("g++", "clang++", "c++"))
-
-
-def _frames(leader: Leader, first: int, last: int) -> Leader:
-    return Leader(
-        leader.position[first:last],
-        leader.speed[first:last],
-        leader.acceleration[first:last],
-        leader.length,
-    )
 
 
 @same_environment()
@@ -309,21 +272,17 @@ def simulate(
     if outside == "refuse":
         _check_bounds(model, parameters)
     windows = _windows(model, parameters, start.speed, leader.position.shape[-1] - 1, window)
-    batch = _batch(leader, start, windows)
+    shapes = [leader.position.shape[:-1], leader.length.shape, *(state.shape for state in start)]
+    for _, _, p in windows:
+        shapes += [value.shape for value in p.values()]
+    batch = common_shape(shapes)
     stepper = MemoryStepper(model, dt, compile=compile)
-    everywhere = Start(
-        start.position.expand(batch), start.speed.expand(batch), start.acceleration.expand(batch)
-    )
-    follower = stepper.begin(everywhere)
-    in_time = Leader(
-        _time_first(leader.position),
-        _time_first(leader.speed),
-        _time_first(leader.acceleration),
-        leader.length,
-    )
+    follower = stepper.begin(Start(*(state.expand(batch) for state in start)))
+    in_time = [signal.movedim(-1, 0).contiguous() for signal in leader[:3]]
     positions, speeds = [follower.position[None]], [follower.speed[None]]
     for first, last, p in windows:
-        follower, position, speed = stepper.advance(follower, _frames(in_time, first, last), p)
+        x, v, a = (signal[first:last] for signal in in_time)
+        follower, position, speed = stepper.advance(follower, Leader(x, v, a, leader.length), p)
         positions.append(position)
         speeds.append(speed)
     position = torch.cat(positions).movedim(0, -1)
@@ -360,23 +319,6 @@ def _check_bounds(
             )
 
 
-def _batch(
-    leader: Leader, start: Start, windows: Sequence[tuple[int, int, _Parameters]]
-) -> torch.Size:
-    """Returns the shape to which leaders, starts and parameters broadcast, without time."""
-    shapes = [leader.position.shape[:-1], leader.length.shape]
-    for state in start:
-        shapes.append(state.shape)
-    for _, _, p in windows:
-        for value in p.values():
-            shapes.append(value.shape)
-    return common_shape(shapes)
-
-
-def _time_first(signal: Tensor) -> Tensor:
-    return signal.movedim(-1, 0).contiguous()
-
-
 def _windows(
     model: DrivingModel,
     parameters: Tensor | Mapping[str, Tensor | float] | None,
@@ -387,7 +329,12 @@ def _windows(
     """Returns (first step, last step, parameters by name) of each stretch with constant ones."""
     space = model.space
     if not isinstance(parameters, Tensor):
-        return [(0, steps, _named(model, parameters or {}, like))]
+        given = {one.name: one.default for one in space} | dict(parameters or {})
+        named = {}
+        for name, value in given.items():
+            own = space[name].name  # raises where there is no such parameter
+            named[own] = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+        return [(0, steps, named)]
     if window is None:
         return [(0, steps, space.unpack(_columns(parameters)))]
     if window < 1 or parameters.dim() < 2:
@@ -405,17 +352,6 @@ def _windows(
     for k, (first, last) in enumerate(zip(cuts, ends, strict=True)):
         windows.append((first, last, space.unpack(columns[..., k, :])))
     return windows
-
-
-def _named(model: DrivingModel, given: Mapping[str, Tensor | float], like: Tensor) -> _Parameters:
-    """Returns every parameter by name: the given ones, the others at their defaults."""
-    for name in given:
-        model.space[name]  # raises where there is no such parameter
-    named = {}
-    for parameter in model.space:
-        value = given.get(parameter.name, parameter.default)
-        named[parameter.name] = torch.as_tensor(value, dtype=like.dtype, device=like.device)
-    return named
 
 
 def _columns(parameters: Tensor) -> Tensor:

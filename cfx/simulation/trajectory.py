@@ -9,14 +9,35 @@ import numpy as np
 import torch
 from torch import Tensor
 
-Terms = Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]]
-"""Simulated speed and gap, measured speed and gap, to what one frame adds to each sum."""
-
 TRANSIENT_S = 5.0
 """Length of the transient of a test part, s (`transient_s` in `data.json`).
 
 Within some such time constant parameters lead from the measured state to a steady one of their own.
 """
+
+
+class ComponentKey(NamedTuple):
+    """Key of a component's equations.
+
+    Attributes:
+        component: the class.
+        settings: as JSON, without what is an input of the equations.
+    """
+
+    component: type
+    settings: str
+
+
+class Terms(NamedTuple):
+    """What one frame adds to each sum: a pure elementwise function.
+
+    Attributes:
+        function: of simulated speed and gap, measured speed and gap.
+        key: tells it from others; equal keys share compiled code.
+    """
+
+    function: Callable[[Tensor, Tensor, Tensor, Tensor], tuple[Tensor, ...]]
+    key: ComponentKey | str
 
 
 class Start(NamedTuple):

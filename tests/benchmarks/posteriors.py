@@ -22,9 +22,8 @@ from scipy.stats import chisquare
 from scoringrules import crps_ensemble
 from torch import Tensor
 
-from cfx.calibration.levels import DETERMINED, MIXED
-from cfx.calibration.optimizers.random import RandomSearch
-from cfx.calibration.settings import CalibrationSettings
+from cfx.calibration.search import RandomSearch
+from cfx.calibration.settings import DETERMINED, MIXED, CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.data.pairs import PairBatch
 from cfx.data.tidy import TidyDataset

@@ -21,9 +21,8 @@ from gpytorch.mlls import ExactMarginalLogLikelihood
 from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives.rmse import SpeedRmse
-from cfx.calibration.optimizers.gradient import GradientSearch
-from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.objectives import SpeedRmse
+from cfx.calibration.search import GradientSearch, RandomSearch
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99

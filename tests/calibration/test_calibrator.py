@@ -13,14 +13,9 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.objectives.base import Objective
-from cfx.calibration.objectives.huber import SpeedHuber
-from cfx.calibration.objectives.mixed import Mixed
-from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
-from cfx.calibration.objectives.theil import TheilU
-from cfx.calibration.optimizers.base import CandidateLosses, Optimizer
-from cfx.calibration.optimizers.gradient import GradientSearch
-from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.objectives import GapRmse, Mixed, Objective, SpeedHuber, SpeedRmse, TheilU
+from cfx.calibration.optimizers import CandidateLosses, Optimizer
+from cfx.calibration.search import GradientSearch, RandomSearch
 from cfx.calibration.shards import CalibrationShard, Solver
 from cfx.core import threads
 from cfx.core.engine import Engine, Report

@@ -6,10 +6,7 @@ import pytest
 import torch
 
 from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
-from cfx.calibration.objectives.base import FrameValues, Objective
-from cfx.calibration.objectives.mixed import Mixed
-from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
-from cfx.calibration.objectives.theil import TheilU
+from cfx.calibration.objectives import FrameValues, GapRmse, Mixed, Objective, SpeedRmse, TheilU
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
 from cfx.models.krauss import Krauss

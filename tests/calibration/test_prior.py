@@ -12,12 +12,10 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives.rmse import SpeedRmse
-from cfx.calibration.optimizers.base import Optimizer
-from cfx.calibration.optimizers.gradient import GradientSearch
-from cfx.calibration.optimizers.random import RandomSearch
-from cfx.calibration.prior import Prior, prior_weight
+from cfx.calibration.losses import Prior, SegmentLosses, prior_weight
+from cfx.calibration.objectives import SpeedRmse
+from cfx.calibration.optimizers import Optimizer
+from cfx.calibration.search import GradientSearch, RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.core.parameters import Parameter, ParameterSpace, squashed
 from cfx.data.pairs import PairBatch

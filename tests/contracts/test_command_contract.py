@@ -7,8 +7,8 @@ import argparse
 import pytest
 
 from cfx.app.commands.cite import CiteCommand
+from cfx.contracts import Check
 from cfx.contracts import commands as checks
-from cfx.contracts.contract import Check
 from cfx.core.command import Command
 
 

@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from cfx.contracts import check_contract
+from cfx.contracts import Check, NotApplicable, check_contract
 from cfx.contracts import demos as checks
-from cfx.contracts.contract import Check, NotApplicable
 from cfx.core.errors import DataError
 from cfx.data.pairs import PairSet
 from cfx.evaluation.demo import PAGE, Demo

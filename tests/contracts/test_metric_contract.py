@@ -6,8 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.contracts import Check, NotApplicable
 from cfx.contracts import metrics as checks
-from cfx.contracts.contract import Check, NotApplicable
 from cfx.evaluation.metrics.base import Metric, Trajectories
 from cfx.evaluation.metrics.errors import MaeSpeed, RmseSpeed
 

@@ -8,9 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.calibration.objectives.base import FrameValues, Objective, root_mean_square
-from cfx.calibration.objectives.rmse import SpeedRmse
-from cfx.calibration.objectives.theil import TheilU
+from cfx.calibration.objectives import FrameValues, Objective, SpeedRmse, TheilU, root_mean_square
 from cfx.contracts import check_contract
 from cfx.contracts import objectives as checks
 

@@ -14,10 +14,8 @@ from cfx.contracts import simulators as checks
 from cfx.core.errors import ConfigError, SumoError
 from cfx.models.base import DrivingModel, Follower
 from cfx.models.krauss import Krauss
-from cfx.simulation.base import Stepper
-from cfx.simulation.memory import MemorySimulator
-from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.simulator import Simulator
+from cfx.simulation.base import Simulator, Stepper
+from cfx.simulation.rollout import MemorySimulator, MemoryStepper
 
 MakeStepper = Callable[[DrivingModel, float], Any]
 

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.evaluation.comparison import against_the_best, verdict
+from cfx.evaluation.statistics import against_the_best, verdict
 
 PAIRS = 40
 

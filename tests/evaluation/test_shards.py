@@ -11,9 +11,8 @@ from torch import Tensor
 
 from cfx.core.local_engine import LocalEngine
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation import shards
-from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.evaluation.shards import simulate_in_shards
+from cfx.evaluation import closed_loop
+from cfx.evaluation.closed_loop import Followers, simulate_closed_loop, simulate_in_shards
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import TrainedOn
 from cfx.policies.gru import GruPolicy
@@ -35,7 +34,7 @@ def pairs_of_several_lengths() -> PairSet:
 
 
 def test_shards_give_what_the_whole_gives(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(shards, "PAIRS_AT_ONCE", 2)
+    monkeypatch.setattr(closed_loop, "PAIRS_AT_ONCE", 2)
     model, pairs = Krauss(), pairs_of_several_lengths()
     batch = PairBatch.of(pairs)
     agent = adaptive(model, GruPolicy(hidden_size=4), len(pairs), 30)
@@ -62,7 +61,7 @@ class Remembering(LocalEngine):
 
 def test_a_shard_holds_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) -> None:
     """It is pickled for a worker, whose memory is small."""
-    monkeypatch.setattr(shards, "PAIRS_AT_ONCE", 2)
+    monkeypatch.setattr(closed_loop, "PAIRS_AT_ONCE", 2)
     model, pairs = Krauss(), pairs_of_several_lengths()
     batch, engine = PairBatch.of(pairs), Remembering()
     agent = adaptive(model, GruPolicy(hidden_size=4), len(pairs), 30)

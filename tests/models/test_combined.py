@@ -9,10 +9,9 @@ import torch
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Leader
-from cfx.models.combined import Combined, for_both
+from cfx.models.composed import Combined, WithResidual, for_both
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
-from cfx.models.residual import WithResidual
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start

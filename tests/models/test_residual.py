@@ -12,9 +12,9 @@ from torch import Tensor
 from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.models.composed import RESIDUAL, WithResidual
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
-from cfx.models.residual import RESIDUAL, WithResidual
 from cfx.models.w99 import W99
 from cfx.simulation.kernel.run import model_key
 from cfx.simulation.rollout import MemoryStepper

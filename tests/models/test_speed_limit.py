@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 
 from cfx.models.base import Follower, Leader
+from cfx.models.composed import COMFORTABLE, LIMIT, WithSpeedLimit
 from cfx.models.idm import IDM
-from cfx.models.speed_limit import COMFORTABLE, LIMIT, WithSpeedLimit
 from cfx.models.w99 import W99
 
 
@@ -42,5 +42,5 @@ def test_without_a_limit_it_is_the_model_itself() -> None:
         assert torch.equal(around.next_speed(follower, leader, p, 0.1), speed)
         memory = model.next_memory(follower, leader, p, 0.1, speed)
         assert torch.equal(around.next_memory(follower, leader, p, 0.1, speed), memory)
-        assert around.space is model.space
+        assert around.space == model.space
         assert around.identity() != model.identity()

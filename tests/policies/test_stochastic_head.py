@@ -14,9 +14,9 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter
 from cfx.models.base import DrivingModel
+from cfx.models.composed import HANDOVER, JERK, TARGET, TIME
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
-from cfx.models.residual import HANDOVER, JERK, TARGET, TIME
 from cfx.models.w99 import W99
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent, AgentState

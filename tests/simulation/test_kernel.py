@@ -2,27 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import pytest
 import torch
 from torch import Tensor
 
-from cfx.calibration.objectives.base import FrameValues, Objective
-from cfx.calibration.objectives.rmse import SpeedRmse
+from cfx.calibration.objectives import FrameValues, Objective, SpeedRmse
 from cfx.core import registry, threads
 from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.models.composed import WithResidual
 from cfx.models.krauss import Krauss
-from cfx.models.residual import WithResidual
 from cfx.models.w99 import W99
 from cfx.simulation.base import Stepper
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import literal
-from cfx.simulation.kernel.keys import ComponentKey, KernelKey
-from cfx.simulation.kernel.run import accumulate
+from cfx.simulation.kernel.run import KernelKey, accumulate
 from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.trajectory import Segments, Start
+from cfx.simulation.trajectory import ComponentKey, Segments, Start, Terms
 
 DT = 0.1
 PROBLEMS, CANDIDATES, STEPS = 5, 70, 40
@@ -110,18 +108,18 @@ def summed_up(
     stepper: Stepper, objective: Objective, segments: Segments, p: Mapping[str, Tensor]
 ) -> Tensor | None:
     """Returns losses `(P, q)` from sums; None where the stepper has none."""
-    sums = stepper.accumulate(segments, p, terms_of(objective), type(objective).__name__)
+    sums = stepper.accumulate(segments, p, terms_of(objective))
     if sums is None:
         return None
     return objective.finish(sums, segments.counted.sum(0).clamp(min=1)[:, None])
 
 
-def terms_of(objective: Objective) -> Callable[..., tuple[Tensor, ...]]:
-    def terms(*signals: Tensor) -> tuple[Tensor, ...]:
+def terms_of(objective: Objective) -> Terms:
+    def of_frame(*signals: Tensor) -> tuple[Tensor, ...]:
         speed, gap, measured_speed, measured_gap = signals
         return objective.terms(FrameValues(speed, gap, measured_speed, measured_gap, DT))
 
-    return terms
+    return Terms(of_frame, type(objective).__name__)
 
 
 @pytest.mark.parametrize("name", with_equations())
@@ -162,10 +160,11 @@ def test_single_precision_stays_single_and_close() -> None:
         DT,
         made_up_segments(torch.float32),
         candidates_of(model, torch.float32),
-        squares,
-        key="single",
+        Terms(squares, "single"),
     )
-    double = accumulate(model, DT, made_up_segments(), candidates_of(model), squares, key="double")
+    double = accumulate(
+        model, DT, made_up_segments(), candidates_of(model), Terms(squares, "double")
+    )
     assert single is not None
     assert double is not None
     assert single[0].dtype == torch.float32
@@ -178,9 +177,9 @@ def test_the_number_of_cores_changes_no_bit(monkeypatch: pytest.MonkeyPatch) -> 
     for name, value in candidates_of(model).items():
         p[name] = value if value.dim() == 0 else value.repeat(1, 100)
     monkeypatch.setattr(threads, "cores", lambda: 1)
-    alone = accumulate(model, DT, segments, p, squares, key="cores")
+    alone = accumulate(model, DT, segments, p, Terms(squares, "cores"))
     monkeypatch.setattr(threads, "cores", lambda: 4)
-    shared = accumulate(model, DT, segments, p, squares, key="cores")
+    shared = accumulate(model, DT, segments, p, Terms(squares, "cores"))
     assert alone is not None
     assert shared is not None
     assert torch.equal(alone[0], shared[0])
@@ -192,8 +191,8 @@ def test_candidates_that_all_problems_share_need_no_copy() -> None:
     for name, value in candidates_of(model).items():
         shared[name] = value if value.dim() == 0 else value[:1]
         copied[name] = value if value.dim() == 0 else value[:1].repeat(PROBLEMS, 1)
-    one = accumulate(model, DT, segments, shared, squares, key="shared")
-    other = accumulate(model, DT, segments, copied, squares, key="shared")
+    one = accumulate(model, DT, segments, shared, Terms(squares, "shared"))
+    other = accumulate(model, DT, segments, copied, Terms(squares, "shared"))
     assert one is not None
     assert other is not None
     assert torch.equal(one[0], other[0])
@@ -203,9 +202,9 @@ def test_nan_in_a_parameter_stays_nan_and_harms_no_other_candidate() -> None:
     model, segments = Krauss(), made_up_segments()
     p = candidates_of(model)
     p["t_r"] = p["t_r"].clone()
-    healthy = accumulate(model, DT, segments, p, squares, key="nan")
+    healthy = accumulate(model, DT, segments, p, Terms(squares, "nan"))
     p["t_r"][2, 5] = torch.nan
-    found = accumulate(model, DT, segments, p, squares, key="nan")
+    found = accumulate(model, DT, segments, p, Terms(squares, "nan"))
     assert found is not None
     assert healthy is not None
     expected = healthy[0].clone()
@@ -271,7 +270,7 @@ class LooksUpWhatIsComputed(Krauss):
 )
 def test_a_model_that_is_not_elementwise_is_left_to_pytorch(model: DrivingModel) -> None:
     p = candidates_of(model)
-    assert accumulate(model, DT, made_up_segments(), p, squares, key="squares") is None
+    assert accumulate(model, DT, made_up_segments(), p, Terms(squares, "squares")) is None
 
 
 class Remembers(Krauss):
@@ -324,7 +323,10 @@ def test_a_memory_begins_with_the_start_and_goes_on_from_step_to_step(model: Dri
 def test_small_work_is_not_worth_a_kernel() -> None:
     model = Krauss()
     stepper = MemoryStepper(model, DT)
-    assert stepper.accumulate(made_up_segments(), candidates_of(model), squares, "small") is None
+    assert (
+        stepper.accumulate(made_up_segments(), candidates_of(model), Terms(squares, "small"))
+        is None
+    )
 
 
 def test_a_library_is_built_once_and_found_again(
@@ -428,12 +430,12 @@ def test_terms_of_single_frames_are_those_of_trajectories(every: int) -> None:
     model, segments = Krauss(), made_up_segments()
     p, terms = candidates_of(model), terms_of(SpeedRmse())
     stepper = MemoryStepper(model, DT, compile="always")
-    found = stepper.frame_terms(segments, p, terms, "SpeedRmse", every)
-    sums = stepper.accumulate(segments, p, terms, "SpeedRmse")
+    found = stepper.accumulate(segments, p, terms, every)
+    sums = stepper.accumulate(segments, p, terms)
     assert found is not None
     assert sums is not None
     assert found[0].shape == (STEPS // every, PROBLEMS, CANDIDATES)
-    single = stepper.frame_terms(segments, p, terms, "SpeedRmse", 1)
+    single = stepper.accumulate(segments, p, terms, 1)
     assert single is not None
     torch.testing.assert_close(found[0], single[0][every - 1 :: every], rtol=0, atol=0)
     torch.testing.assert_close(single[0].sum(0), sums[0], rtol=1e-12, atol=1e-12)

@@ -15,9 +15,8 @@ from cfx.core import registry
 from cfx.core.errors import ConfigError, PluginError
 from cfx.models.krauss import Krauss
 from cfx.results.config import JobConfig
-from cfx.simulation.memory import MemorySimulator
-from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.simulator import Simulator
+from cfx.simulation.base import Simulator
+from cfx.simulation.rollout import MemorySimulator, MemoryStepper
 from cfx_sumo.vtype import SumoVType
 
 QUICK = [

@@ -16,10 +16,10 @@ from torch import Tensor
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.identifiability import slices, training_errors
-from cfx.calibration.objectives.base import Objective
-from cfx.calibration.optimizers.base import Optimizer
+from cfx.calibration.losses import prior_weight
+from cfx.calibration.objectives import Objective
+from cfx.calibration.optimizers import Optimizer
 from cfx.calibration.posterior import posterior_method
-from cfx.calibration.prior import prior_weight
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.core import registry
@@ -43,10 +43,9 @@ from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
 from cfx.results.table import Findings
 from cfx.results.tracker import folder_of, is_run_id
-from cfx.simulation.memory import MemorySimulator
-from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.base import Simulator
+from cfx.simulation.rollout import MemorySimulator, MemoryStepper
 from cfx.simulation.settings import WindowSettings
-from cfx.simulation.simulator import Simulator
 from cfx.simulation.windows import Split
 
 _CONSTANT = ("default", "population", "fixed")

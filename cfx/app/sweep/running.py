@@ -139,7 +139,7 @@ class Sweep:
 
     def _finish(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
         """Writes and prints the summary, and says how to go on; returns the exit code."""
-        from cfx.evaluation.comparison import against_the_best, verdict  # imports NumPy
+        from cfx.evaluation.statistics import against_the_best, verdict  # imports NumPy
 
         lines = self._close_runs()
         table = rows(statuses)

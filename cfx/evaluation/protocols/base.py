@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.calibrator import Calibrator, Labels
-from cfx.calibration.objectives.base import Objective
+from cfx.calibration.objectives import Objective
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.engine import Engine

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes, simulate_in_shards
 from cfx.evaluation.evaluate import ComparedPairs, closed_loop_errors, evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import ProtocolContext
@@ -26,7 +26,6 @@ from cfx.evaluation.protocols.past import (
     with_bounds_of_other_folds,
 )
 from cfx.evaluation.result import Evaluation, Platoon
-from cfx.evaluation.shards import simulate_in_shards
 from cfx.policies.agent import Agent
 from cfx.policies.default import DefaultPolicy
 from cfx.policies.fixed import FixedPolicy

@@ -3,7 +3,7 @@
 The past of each driver, up to the test part, is split once more. On the first 60 % of it the
 driver's own parameters are calibrated, and the policy observes it; the rest is simulated with each
 of the two, and neither has seen it. Of the errors of speed e_own(t) and e_policy(t) there follows
-the policy's share where both drive together (`cfx.models.combined`): that of the mean which errs
+the policy's share where both drive together (`cfx.models.composed`): that of the mean which errs
 least, and not far from a half,
 
     minimise over w   sum (w e_policy + (1 - w) e_own)^2 + S (w - 1/2)^2
@@ -29,10 +29,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.closed_loop import ClosedLoop, Followers, OwnParameters
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, OwnParameters, simulate_in_shards
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.result import Array
-from cfx.evaluation.shards import simulate_in_shards
 from cfx.policies.agent import Agent
 from cfx.policies.context import ExpectedError, conformal_bound
 from cfx.policies.fixed import FixedPolicy

@@ -11,12 +11,11 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.core.component import Settings
-from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes, simulate_in_shards
 from cfx.evaluation.evaluate import ComparedPairs, evaluate
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Platoon
-from cfx.evaluation.shards import simulate_in_shards
 from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.policies.agent import Agent
 from cfx.policies.default import DefaultPolicy

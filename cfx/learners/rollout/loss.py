@@ -18,8 +18,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives.base import FrameValues, Objective
-from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
+from cfx.calibration.objectives import FrameValues, GapRmse, Objective, SpeedRmse
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.inputs import RolloutBatch

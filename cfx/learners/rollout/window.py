@@ -24,7 +24,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.calibration import prior
+from cfx.calibration import losses
 from cfx.core import parameters
 from cfx.core.component import folder_hash
 from cfx.models.base import DrivingModel, Follower, Leader
@@ -32,7 +32,7 @@ from cfx.policies import features
 from cfx.policies.core import AgentCore
 from cfx.policies.features import History
 from cfx.simulation.kernel.compiler import torch_compiled
-from cfx.simulation.kernel.keys import component_code
+from cfx.simulation.kernel.run import component_code
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.windows import WindowSettings
 
@@ -109,7 +109,7 @@ class WindowStep:
             return None
         settings = [self.model.equations_key(), repr(self.space), self.length, self.stride, self.dt]
         read = [core.inputs, core.summary, core.scaler.mean.shape[-1]]
-        rooms = [folder_hash(module.__file__) for module in (features, parameters, prior)]
+        rooms = [folder_hash(module.__file__) for module in (features, parameters, losses)]
         return [code, settings, read, rooms, folder_hash(__file__)]
 
     def observe(

@@ -1,7 +1,7 @@
 """The direct head with a residual: parameters, which take over from the acceleration at the start.
 
 It is for policies that are not trained. Their networks answer the driving model's parameters; those
-of the residual (`cfx.models.residual`) are the defaults, but for the jerk, which is measured.
+of the residual (`cfx.models.composed`) are the defaults, but for the jerk, which is measured.
 
 Shapes: `*batch` any leading dimensions, m tuned parameters of the driving model, n = m + 5.
 """
@@ -16,7 +16,7 @@ from torch import Tensor
 
 from cfx.core.parameters import ParameterSpace
 from cfx.models.base import DrivingModel
-from cfx.models.residual import RESIDUAL, WithResidual, with_residual
+from cfx.models.composed import RESIDUAL, WithResidual, with_residual
 from cfx.policies.features import History
 from cfx.policies.heads.direct import DirectHead
 from cfx.policies.heads.residual import with_measured_jerk

@@ -1,7 +1,7 @@
 """The residual head: offsets from base parameters, and a residual acceleration.
 
 The network chooses, beside the model's parameters, how fast the model takes over from the
-acceleration at the start (`cfx.models.residual`), how fast its jerk is forgotten, and where the
+acceleration at the start (`cfx.models.composed`), how fast its jerk is forgotten, and where the
 residual goes. So the policy starts with exactly the acceleration that the driver has and
 with their jerk, and what becomes of both depends on the state that the network reads. An untrained
 network is the base, which takes over within seconds. The jerk is measured between the last two
@@ -20,7 +20,7 @@ from torch import Tensor
 
 from cfx.core.parameters import ParameterSpace
 from cfx.models.base import DrivingModel
-from cfx.models.residual import JERK, RESIDUAL, WithResidual
+from cfx.models.composed import JERK, RESIDUAL, WithResidual
 from cfx.policies.features import History
 from cfx.policies.heads.offset import OffsetHead
 

@@ -47,7 +47,7 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel
-from cfx.models.residual import HANDOVER, RESIDUAL, TARGET, TIME, WithResidual
+from cfx.models.composed import HANDOVER, RESIDUAL, TARGET, TIME, WithResidual
 from cfx.policies.heads.offset import step_of
 from cfx.policies.heads.residual import ResidualHead
 

@@ -56,7 +56,7 @@ def parameter_names(count: int) -> tuple[str, ...]:
 class Statement(NamedTuple):
     """One operation: `name = expression`, a number or (`is_condition`) true or false.
 
-    `cfx.simulation.kernel.adjoint` differentiates `operation` by its `operands`.
+    `cfx.simulation.kernel.elementwise` differentiates `operation` by its `operands`.
     """
 
     name: str
@@ -120,7 +120,8 @@ def record(
         )
         after = advance_vehicle(model, follower, leader, p, dt)
         gap = known["leader_rear"] - after.position
-        added = terms(after.speed, gap, known["measured_speed"], known["measured_gap"])
+        measured = known["measured_speed"], known["measured_gap"]
+        added = terms.function(after.speed, gap, *measured)
         return (after.position, after.speed, after.acceleration, after.memory, *added)
 
     examples = []

@@ -6,6 +6,7 @@ Shapes: P problems (segments of trajectories), q candidates of each, K steps of 
 from __future__ import annotations
 
 import ctypes
+import inspect
 import logging
 import threading
 from collections.abc import Mapping, Sequence
@@ -14,15 +15,16 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
+from cfx.core.component import content_key, folder_hash
 from cfx.core.memory import keep_freed_memory
 from cfx.core.threads import share
 from cfx.models.base import DrivingModel
+from cfx.simulation import step
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.kernel.graph import record
-from cfx.simulation.kernel.keys import ComponentKey, KernelKey
 from cfx.simulation.kernel.source import BLOCK, SIGNALS, write
-from cfx.simulation.trajectory import Segments, Terms, common_shape
+from cfx.simulation.trajectory import ComponentKey, Segments, Terms, common_shape
 
 log = logging.getLogger(__name__)
 
@@ -34,6 +36,67 @@ class _View(ctypes.Structure):
     """A tensor as the kernel sees it: where it lies, and its strides over problems and the rest."""
 
     _fields_ = (("data", ctypes.c_void_p), ("problem", ctypes.c_long), ("other", ctypes.c_long))
+
+
+class KernelKey(NamedTuple):
+    """Key of a kernel.
+
+    Attributes:
+        model: the driving model.
+        temperature: of the model.
+        terms: what the terms depend on; a name that only this process understands otherwise.
+        dt: time step, s.
+        parameters: names of the model's parameters, and whether candidates differ in each.
+        dtype: of all values.
+        summed: whether terms are summed up over frames.
+    """
+
+    model: ComponentKey
+    temperature: float
+    terms: ComponentKey | str
+    dt: float
+    parameters: tuple[tuple[str, bool], ...]
+    dtype: torch.dtype
+    summed: bool = True
+
+    def lasting(self) -> str | None:
+        """Returns a key that other processes agree on; None if there is none.
+
+        Classes made inside functions have none: what they do may depend on variables there.
+        """
+        if isinstance(self.terms, str):
+            return None
+        # The step itself, and how it is recorded and written.
+        described: list[object] = [folder_hash(step.__file__), folder_hash(__file__)]
+        for key in (self.model, self.terms):
+            code = component_code(key.component)
+            if code is None:
+                return None
+            described.append([code, key.settings])
+        described += [self.temperature, self.dt, self.parameters, self.dtype, self.summed]
+        described.append(torch.__version__)
+        return content_key(described)
+
+
+def component_code(component: type) -> list[str] | None:
+    """Returns the name and the code of a class and all that it inherits from.
+
+    It is None where no file has it.
+    """
+    if getattr(component, "process_code", ""):
+        return None
+    found = []
+    for part in component.__mro__:
+        if part.__module__ in {"abc", "builtins", "typing"}:
+            continue
+        if "<locals>" in part.__qualname__:
+            return None
+        try:
+            code = folder_hash(inspect.getfile(part))
+        except (OSError, TypeError):
+            return None
+        found.append(f"{part.__module__}.{part.__qualname__} {code}")
+    return found
 
 
 _KERNELS: dict[KernelKey, _Kernel | None] = {}
@@ -51,8 +114,6 @@ def accumulate(
     segments: Segments,
     p: Mapping[str, Tensor],
     terms: Terms,
-    *,
-    key: ComponentKey | str,
     every: int | None = None,
 ) -> tuple[Tensor, ...] | None:
     """Simulates segments in closed loop and computes the terms of their frames that count.
@@ -65,14 +126,13 @@ def accumulate(
         segments: P segments, on the CPU.
         p: one tensor per parameter, `()`, or broadcasting to `(P, q)`.
         terms: what a frame adds to each sum.
-        key: what the terms depend on; equal keys share a kernel.
         every: the terms of each so many-th frame, instead of sums.
 
     Returns:
         Each sum, `(P, q)`, or each term of frames `every`, `2 every` and so on, `(K // every, P,
         q)`, 0 where a frame does not count; None where no kernel can be made of this model.
     """
-    kernel = _kernel(model, dt, p, terms, key, summed=every is None)
+    kernel = _kernel(model, dt, p, terms, summed=every is None)
     if kernel is None:
         return None
     keep_freed_memory()
@@ -90,16 +150,9 @@ def accumulate(
     return tuple(sums)
 
 
-def exists(
-    model: DrivingModel,
-    dt: float,
-    p: Mapping[str, Tensor],
-    terms: Terms,
-    *,
-    key: ComponentKey | str,
-) -> bool:
+def exists(model: DrivingModel, dt: float, p: Mapping[str, Tensor], terms: Terms) -> bool:
     """Says whether `accumulate` has a kernel for these arguments; makes it at the first call."""
-    return _kernel(model, dt, p, terms, key) is not None
+    return _kernel(model, dt, p, terms) is not None
 
 
 def model_key(model: DrivingModel) -> ComponentKey:
@@ -112,7 +165,6 @@ def _kernel(
     dt: float,
     p: Mapping[str, Tensor],
     terms: Terms,
-    key: ComponentKey | str,
     *,
     summed: bool = True,
 ) -> _Kernel | None:
@@ -121,7 +173,7 @@ def _kernel(
     whole_key = KernelKey(
         model=model_key(model),
         temperature=float(model.temperature),
-        terms=key,
+        terms=terms.key,
         dt=dt,
         parameters=parameters,
         dtype=next(iter(p.values())).dtype,

@@ -43,7 +43,7 @@ from linear_operator.utils.warnings import NumericalWarning
 from pydantic import Field
 from torch import Tensor
 
-from cfx.calibration.optimizers.base import AT_ONCE, CandidateLosses, Optimizer, check_room, sobol
+from cfx.calibration.optimizers import AT_ONCE, CandidateLosses, Optimizer, check_room, sobol
 from cfx.core.component import Settings
 
 _NOISE = 1e-6

@@ -13,10 +13,9 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives.base import Objective
-from cfx.calibration.optimizers.base import Optimizer
-from cfx.calibration.prior import Prior
+from cfx.calibration.losses import Prior, SegmentLosses
+from cfx.calibration.objectives import Objective
+from cfx.calibration.optimizers import Optimizer
 from cfx.core.component import Settings
 from cfx.core.parameters import squashed
 from cfx.core.registry import create

@@ -13,7 +13,7 @@ from torch import Tensor
 from cfx.core.errors import ConfigError
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.protocols.held_out import HeldOut
-from cfx.models.residual import TIME
+from cfx.models.composed import TIME
 from cfx.policies.agent import Agent
 from cfx.policies.base import ConstantNetwork
 from cfx.policies.core import AgentCore, features_read

@@ -87,7 +87,7 @@ class Forecast(FoldsOrFinished):
       origin: what every origin may read, and nothing after it;
     - `population_residual`, `fixed_residual`: the same with a residual: they start with the
       acceleration and the jerk at the origin, from which the model takes over within seconds
-      (`cfx.models.residual`);
+      (`cfx.models.composed`);
     - `policy`: observes all history up to each origin (`history` bounds it) and drives on from
       there, seeing the simulated follower.
 

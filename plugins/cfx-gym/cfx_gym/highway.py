@@ -14,7 +14,7 @@ import torch
 from highway_env.vehicle.behavior import IDMVehicle
 
 from cfx.core.errors import ConfigError
-from cfx.models.speed_limit import COMFORTABLE
+from cfx.models.composed import COMFORTABLE
 from cfx.policies.driver_step import DriverState, DriverStep, Motion
 from cfx_gym.drivers import driver_step
 

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
 from cfx.core.parameters import ParameterSpace, squashed
-from cfx.simulation.kernel.keys import ComponentKey
+from cfx.simulation.trajectory import ComponentKey, Terms
 from cfx_posteriors import noise
 
 DEVIATION = 1.5
@@ -182,13 +182,13 @@ class Posterior:
         They are 0 where they do not count.
         """
         p = self.segments.parameters(torch.sigmoid(logits))
-        terms = SignalErrors(self.signal)
-        key = ComponentKey(SignalErrors, self.signal)
+        errors = SignalErrors(self.signal)
+        terms = Terms(errors, ComponentKey(SignalErrors, self.signal))
         simulator = self.segments.simulator
-        found = simulator.frame_terms(self.segments.segments, p, terms, key, self.stride)
+        found = simulator.accumulate(self.segments.segments, p, terms, self.stride)
         if found is None:
             frames = self.segments.simulated(p, gap=self.signal == "gap")
-            found = (terms(*frames[:4])[0][self.stride - 1 :: self.stride],)
+            found = (errors(*frames[:4])[0][self.stride - 1 :: self.stride],)
         return torch.where(self.counted > 0, found[0], 0.0)
 
     def residual(self, place: Tensor) -> Tensor:

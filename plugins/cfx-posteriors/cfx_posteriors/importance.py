@@ -29,7 +29,7 @@ import torch
 from arviz_stats.base.array import array_stats
 from torch import Tensor
 
-from cfx.calibration.levels import RELIABLE
+from cfx.calibration.settings import RELIABLE
 from cfx_posteriors.density import Posterior
 from cfx_posteriors.laplace import Normal, curvature
 from cfx_posteriors.tempered import tempered

@@ -15,10 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx.calibration.levels import LEVEL
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.posterior import DriverPosteriors, PosteriorMethod
-from cfx.calibration.settings import CalibrationSettings
+from cfx.calibration.settings import LEVEL, CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch

@@ -127,7 +127,7 @@ def draw(
 
 def _compared(jobs: Sequence[Job], folder: Path, formats: Sequence[str]) -> list[str]:
     """Draws jobs against the one that is closest to the drivers; returns what to tell the user."""
-    from cfx.evaluation.comparison import against_the_best, verdict
+    from cfx.evaluation.statistics import against_the_best, verdict
     from cfx.figures.write import write_figure
     from cfx_report.figures.models import draw_models
 

@@ -20,7 +20,7 @@ from torch import Tensor
 from cfx import Start
 from cfx.core.threads import one_thread
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.speed_limit import LIMIT, WithSpeedLimit
+from cfx.models.composed import LIMIT, WithSpeedLimit
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.features import History
 from cfx.simulation.rollout import MemoryStepper

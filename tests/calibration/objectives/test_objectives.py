@@ -12,10 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfx import FrameValues, Objective
-from cfx.calibration.objectives.huber import SpeedHuber
-from cfx.calibration.objectives.mixed import Mixed
-from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
-from cfx.calibration.objectives.theil import TheilU
+from cfx.calibration.objectives import GapRmse, Mixed, SpeedHuber, SpeedRmse, TheilU
 from cfx.contracts import check_contract
 from cfx.core import registry
 from cfx.core.errors import ConfigError

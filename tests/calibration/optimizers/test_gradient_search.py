@@ -8,8 +8,7 @@ from pydantic import ValidationError
 from scipy.optimize import minimize
 from torch import Tensor
 
-from cfx.calibration.optimizers.gradient import GradientSearch, _stages
-from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.search import GradientSearch, RandomSearch, _stages
 from cfx.contracts import check_contract
 from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.core.errors import ConfigError
@@ -99,7 +98,7 @@ def test_settings_alone_say_so_too() -> None:
 @pytest.mark.parametrize("searches", [1, 3, 4, 9])
 def test_stages_use_as_many_samples_as_there_are(searches: int) -> None:
     stages, rest = _stages(searches, 1000, 11)
-    used = sum(stage.searches * stage.rounds * 11 for stage in stages)
+    used = sum(count * rounds * 11 for count, rounds in stages)
     assert used + rest == 1000
-    assert rest < stages[-1].searches * 11
-    assert stages[0].searches == searches
+    assert rest < stages[-1][0] * 11
+    assert stages[0][0] == searches

@@ -4,7 +4,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.calibration.optimizers.base import TIE_ABSOLUTE, CandidateLosses, Optimizer
+from cfx.calibration.optimizers import TIE_ABSOLUTE, CandidateLosses, Optimizer
 from cfx.contracts.optimizers import Problems, distance
 from cfx.core.errors import PluginError
 

@@ -16,7 +16,7 @@ import torch
 import cfx
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.optimizers.random import RandomSearch
+from cfx.calibration.search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.contracts import protocols
 from cfx.core.errors import DataError

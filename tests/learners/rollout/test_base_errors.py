@@ -7,8 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.calibration.objectives.rmse import GapRmse
-from cfx.calibration.objectives.theil import TheilU
+from cfx.calibration.objectives import GapRmse, TheilU
 from cfx.learners.rollout import loss
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.inputs import RolloutBatch

@@ -10,11 +10,7 @@ import pandas as pd
 import pytest
 import torch
 
-from cfx.calibration.objectives.base import Objective
-from cfx.calibration.objectives.huber import SpeedHuber
-from cfx.calibration.objectives.mixed import Mixed
-from cfx.calibration.objectives.rmse import GapRmse, SpeedRmse
-from cfx.calibration.objectives.theil import TheilU
+from cfx.calibration.objectives import GapRmse, Mixed, Objective, SpeedHuber, SpeedRmse, TheilU
 from cfx.core.errors import ConfigError
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner

@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cfx.evaluation.comparison import Against
 from cfx.evaluation.headline import opposite
+from cfx.evaluation.statistics import Against
 from cfx.figures.canvas import canvas, draw_points, most_across, points, styled, wrapped
 from cfx.figures.text import EDGE, JOB_COLOURS, percent
 
@@ -23,7 +23,7 @@ def draw_models(errors: Mapping[str, pd.DataFrame], compared: Sequence[Against])
     """Draws a panel per other job: a dot per pair; above the line the best job is closer.
 
     Args:
-        errors: as `cfx.evaluation.comparison.against_the_best` takes them.
+        errors: as `cfx.evaluation.statistics.against_the_best` takes them.
         compared: as it returns them; at least one.
     """
     shown = compared[:_MOST]

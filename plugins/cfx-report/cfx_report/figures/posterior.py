@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.calibration.levels import DETERMINED, LEVEL, reliable
+from cfx.calibration.settings import DETERMINED, LEVEL, reliable
 from cfx.figures.canvas import canvas, legend_above, most_across, points, styled, wrapped
 from cfx.figures.figure import JobFigure, ParameterAxis, Results
 from cfx.figures.text import EDGE, INK, colour_of, plural, short, unit_label

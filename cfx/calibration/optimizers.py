@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Event
 from typing import Any, ClassVar, Protocol
 
@@ -202,28 +202,21 @@ class Optimizer(Component):
         guesses = guesses.double().clamp(0.0, 1.0)
         ended = Event()
 
-        def part(first: int) -> tuple[_CheckedLosses, Tensor]:
+        def solved(first: int) -> tuple[Tensor, ...]:
             last = min(first + chunk, problems)
-            losses, origin = objective.select(first, last), registry.origin(self)
-            return _CheckedLosses(losses, progress, n, origin, ended), guesses[first:last]
-
-        def reduced(own: Tensor, tried: Tried, losses: Tensor) -> tuple[Tensor, ...]:
+            own, origin = guesses[first:last], registry.origin(self)
+            losses = _CheckedLosses(objective.select(first, last), progress, n, origin, ended)
+            tried, found = self.solve(losses, own, seed=seed)
             blocks = tried if isinstance(tried, tuple) else (tried,)
-            self._check(blocks, losses, own)
-            return _reduce(blocks, losses, own, self.space_filling(), tolerance)
-
-        def solve(first: int) -> tuple[Tensor, ...]:
-            losses, own = part(first)
-            return reduced(own, *self.solve(losses, own, seed=seed))
+            self._check(blocks, found, own)
+            return _reduce(blocks, found, own, self.space_filling(), tolerance)
 
         starts = range(0, problems, chunk)
         try:
             if self.in_threads and guesses.device.type == "cpu" and len(starts) > 1:
-                pieces = share(solve, starts, level="chunks")
+                pieces = share(solved, starts, level="chunks")
             else:
-                pieces = []
-                for losses, own in map(part, starts):
-                    pieces.append(reduced(own, *self.solve(losses, own, seed=seed)))
+                pieces = [solved(first) for first in starts]
         finally:
             ended.set()  # one thread failed, or a signal came: stop the others
         best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
@@ -273,9 +266,7 @@ def _reduce(
     best = best.where(some[:, None], guesses[:, 0])
     loss = losses.gather(1, index[:, None]).squeeze(1).where(some, torch.inf)
     # Where all space-filling evaluations are guesses, the guesses count.
-    first = 0
-    if space_filling > g:
-        first = g
+    first = g if space_filling > g else 0
     filling = _low_median_high(losses[:, first:space_filling], finite[:, first:space_filling])
     return best, loss, filling, (~finite).sum(dim=1)
 
@@ -286,9 +277,6 @@ def _low_median_high(losses: Tensor, finite: Tensor) -> Tensor:
         # NumPy sorts with vector instructions, in less time than PyTorch finds the median.
         ordered = np.sort(losses.detach().numpy(), axis=1)
         return torch.as_tensor(ordered[:, [0, (losses.shape[1] - 1) // 2, -1]])
-    if bool(finite.all()):
-        low, high = losses.aminmax(dim=1)
-        return torch.stack([low, losses.median(dim=1).values, high], dim=1)
     usable = finite.any(dim=1)
     low = losses.where(finite, torch.inf).amin(dim=1)
     high = losses.where(finite, -torch.inf).amax(dim=1)
@@ -322,67 +310,54 @@ def _in_unit_space(candidates: Tensor) -> bool:
     return bool(((candidates >= 0) & (candidates <= 1)).all())
 
 
+@dataclass(frozen=True)
 class _CheckedLosses:
     """Evaluates candidates in blocks of `AT_ONCE`, and replaces NaN by infinity.
 
     Counts evaluations. Refuses candidates outside the bounds, and all after the minimization ended.
     """
 
-    def __init__(
-        self,
-        objective: CandidateLosses,
-        progress: Progress,
-        n: int,
-        optimizer: str,
-        ended: Event,
-    ) -> None:
-        self._objective = objective
-        self._progress = progress
-        self._n = n
-        self._optimizer = optimizer
-        self._ended = ended
+    objective: CandidateLosses
+    progress: Progress
+    n: int
+    optimizer: str
+    ended: Event
 
     @property
     def problems(self) -> int:
-        return self._objective.problems
+        return self.objective.problems
 
     def __call__(self, candidates: Tensor) -> Tensor:
-        if self._ended.is_set():
+        if self.ended.is_set():
             raise RuntimeError("this minimization has ended")
         shape = tuple(candidates.shape)
         if (
             candidates.dtype != torch.float64
             or len(shape) != 3
-            or (shape[0], shape[2]) != (self.problems, self._n)
+            or (shape[0], shape[2]) != (self.problems, self.n)
         ):
             raise PluginError(
-                f"{self._optimizer}: it asked for candidates {shape} in {candidates.dtype}; it must"
-                f" ask for ({self.problems}, q, {self._n}) in float64"
+                f"{self.optimizer}: it asked for candidates {shape} in {candidates.dtype}; it must"
+                f" ask for ({self.problems}, q, {self.n}) in float64"
             )
         if not _in_unit_space(candidates):
             raise PluginError(
-                f"{self._optimizer}: it asked for a candidate outside the bounds [0, 1] of unit"
+                f"{self.optimizer}: it asked for a candidate outside the bounds [0, 1] of unit"
                 " space"
             )
         found = [candidates.new_empty((self.problems, 0))]
         for block in torch.split(candidates, AT_ONCE, dim=1):
             if block.shape[1] == 0:
                 continue
-            losses = self._objective(block).to(torch.float64)
-            self._progress(losses.numel())
+            losses = self.objective(block).to(torch.float64)
+            self.progress(losses.numel())
             if not bool(losses.sum().isfinite()):
                 losses = losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
             found.append(losses)
         return torch.cat(found, dim=1)
 
     def select(self, first: int, last: int) -> CandidateLosses:
-        return _CheckedLosses(
-            self._objective.select(first, last),
-            self._progress,
-            self._n,
-            self._optimizer,
-            self._ended,
-        )
+        return replace(self, objective=self.objective.select(first, last))
 
 
 def check_room(evaluations: int, guesses: int, *, key: str) -> None:

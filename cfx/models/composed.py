@@ -1,4 +1,6 @@
-"""A driving model that takes over from a vehicle's measured acceleration.
+"""Driving models made of others: with a residual acceleration, two together, with a speed limit.
+
+**With a residual**, a model takes over from a vehicle's measured acceleration:
 
     a(t) = (1 - m(t)) h(t) + m(t) a_model(t) + sqrt(m(t)) r(t)
     m(t) = 1 - exp(-((t - t0) / tau_m)^2)
@@ -22,7 +24,9 @@ first step only; 0 where it is unknown. With c drawn at random the residual is
 the auto-regressive noise of C. Zhang and L. Sun (2024), *Bayesian calibration of the intelligent
 driver model*, IEEE T-ITS 25(8), whose errors of acceleration are AR(1).
 
-It never prevents a vehicle from braking hard enough to avoid its leader: see `WithResidual`.
+**Two models together** drive with the weighted mean of their accelerations. Combining forecasts
+with such a weight is J. M. Bates and C. W. J. Granger (1969), *The combination of forecasts*, OR
+20(4). Where one model's errors say little about the other's, the mean errs less than either.
 
 Shapes: `*batch` are any leading dimensions; m is the width of the inner model's memory.
 """
@@ -42,6 +46,143 @@ from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.regimes import Temperature, safe_sqrt
+
+
+class Composed(DrivingModel):
+    """Base of driving models that have another one inside.
+
+    Limits are the inner model's. Parameters and memory are the inner model's, then its own.
+
+    Args:
+        inner: the model inside.
+        further: parameters behind the inner model's.
+        width: of its own memory.
+    """
+
+    parameters = ParameterSpace(())
+
+    def __init__(
+        self, inner: DrivingModel, further: tuple[Parameter, ...] = (), width: int = 0
+    ) -> None:
+        self.inner = inner
+        self.settings = inner.settings
+        self.further = further
+        self.space = replace(inner.space, parameters=(*inner.space, *further))
+        self.memory_size = inner.memory_size + width
+        self.temperature = inner.temperature
+
+    @property
+    def adaptation_space(self) -> ParameterSpace:
+        space = self.inner.adaptation_space
+        return replace(space, parameters=(*space, *self.further))
+
+    def identity(self) -> dict[str, Any]:
+        return {"composed": folder_hash(__file__), "model": self.inner.identity()}
+
+    def equations_key(self) -> str:
+        return content_key(self.identity())
+
+    def at_temperature(self, temperature: Temperature) -> Self:
+        model = copy.copy(self)
+        model.temperature = temperature
+        model.inner = self.inner.at_temperature(temperature)
+        return model
+
+    def next_memory(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
+    ) -> Tensor:
+        return self.inner.next_memory(self.inside(follower), leader, p, dt, speed)
+
+    def initial_memory(self, speed: Tensor) -> Tensor:
+        width = self.memory_size - self.inner.memory_size
+        own = torch.zeros((*speed.shape, width), dtype=speed.dtype, device=speed.device)
+        return torch.cat([self.inner.initial_memory(speed), own], -1)
+
+    def inside(self, follower: Follower) -> Follower:
+        """Returns the follower as the inner model knows it."""
+        return follower._replace(memory=follower.memory[..., : self.inner.memory_size])
+
+
+WEIGHT = Parameter(
+    "weight", "1", 0.0, 1.0, 0.5, "share of the first model in the acceleration", "half of each"
+)
+
+PREFIX = "second_"
+"""Before the names of the second model's parameters."""
+
+
+class Combined(Composed):
+    """Two driving models that share one vehicle.
+
+        v(t + dt) = w v_1(t + dt) + (1 - w) v_2(t + dt)
+
+    v_1 and v_2 are the next speeds that the two want from the same state. The mean of speeds one
+    step ahead is that of accelerations. Parameters are the first model's, the second's with the
+    prefix `second_`, and `weight`.
+
+    Args:
+        first, second: the models.
+    """
+
+    reference = "the weighted mean of two models"
+
+    def __init__(self, first: DrivingModel, second: DrivingModel) -> None:
+        renamed = tuple(replace(one, name=f"{PREFIX}{one.name}") for one in second.space)
+        super().__init__(first, (*renamed, WEIGHT), second.memory_size)
+        self.second = second
+
+    def identity(self) -> dict[str, Any]:
+        return {**super().identity(), "second": self.second.identity()}
+
+    def at_temperature(self, temperature: Temperature) -> Self:
+        model = super().at_temperature(temperature)
+        model.second = self.second.at_temperature(temperature)
+        return model
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        wanted = self.inner.next_speed(self.inside(follower), leader, p, dt)
+        other = self.second.next_speed(self._beside(follower), leader, of_second(p), dt)
+        weight = p[WEIGHT.name]
+        return weight * wanted + (1.0 - weight) * other
+
+    def next_memory(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
+    ) -> Tensor:
+        first = super().next_memory(follower, leader, p, dt, speed)
+        beside = self._beside(follower)
+        return torch.cat(
+            [first, self.second.next_memory(beside, leader, of_second(p), dt, speed)], -1
+        )
+
+    def initial_memory(self, speed: Tensor) -> Tensor:
+        return torch.cat([self.inner.initial_memory(speed), self.second.initial_memory(speed)], -1)
+
+    def _beside(self, follower: Follower) -> Follower:
+        """Returns the follower as the second model knows it."""
+        return follower._replace(memory=follower.memory[..., self.inner.memory_size :])
+
+
+def of_second(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Returns the second model's parameters under its own names."""
+    return {
+        name.removeprefix(PREFIX): value for name, value in p.items() if name.startswith(PREFIX)
+    }
+
+
+def for_both(
+    first: Mapping[str, Tensor], second: Mapping[str, Tensor], weight: Tensor
+) -> dict[str, Tensor]:
+    """Returns the parameters of a combined model.
+
+    Args:
+        first, second: of each model, by name.
+        weight: share of the first, `(*batch,)`.
+    """
+    renamed = {f"{PREFIX}{name}": value for name, value in second.items()}
+    return {**first, **renamed, WEIGHT.name: weight}
+
 
 TIME = Parameter(
     "residual_time",
@@ -108,7 +249,7 @@ _HARD = 2.0
 """m/s2: from this needed deceleration on, the residual lessens no braking that is needed."""
 
 
-class WithResidual(DrivingModel):
+class WithResidual(Composed):
     """Any driving model, which takes over from the acceleration at the start, and a residual.
 
     Parameters are the model's, then those of `RESIDUAL`. Memory `(*batch, m + 4)` is the model's,
@@ -128,7 +269,6 @@ class WithResidual(DrivingModel):
         ConfigError: the model has equations in a simulator only.
     """
 
-    parameters = ParameterSpace(RESIDUAL)
     reference = "any model, which takes over from the acceleration at the start"
 
     def __init__(self, model: DrivingModel) -> None:
@@ -138,32 +278,12 @@ class WithResidual(DrivingModel):
                 " residual can be added to its acceleration; choose a model that cfx has, such as"
                 " krauss or idm"
             )
-        self.inner = model
-        self.settings = model.settings
-        self.space = with_residual(model.space)
-        self.memory_size = model.memory_size + _WIDTH
-        self.temperature = model.temperature
-
-    @property
-    def adaptation_space(self) -> ParameterSpace:
-        return with_residual(self.inner.adaptation_space)
-
-    def identity(self) -> dict[str, Any]:
-        return {"residual": folder_hash(__file__), "model": self.inner.identity()}
-
-    def equations_key(self) -> str:
-        return content_key(self.inner.identity())
-
-    def at_temperature(self, temperature: Temperature) -> Self:
-        model = copy.copy(self)
-        model.temperature = temperature
-        model.inner = self.inner.at_temperature(temperature)
-        return model
+        super().__init__(model, RESIDUAL, _WIDTH)
 
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:
-        wanted = self.inner.next_speed(self._inner(follower), leader, p, dt)
+        wanted = self.inner.next_speed(self.inside(follower), leader, p, dt)
         alone = (wanted - follower.speed) / dt
         share = -torch.expm1(-(follower.memory[..., _PASSED] / p[HANDOVER.name]).square())
         held = self._remembered(follower, _HELD, follower.acceleration)
@@ -181,17 +301,9 @@ class WithResidual(DrivingModel):
         kept = torch.exp(-dt / p[TIME.name])
         residual = target + (follower.memory[..., _RESIDUAL] - target) * kept
         passed = follower.memory[..., _PASSED] + dt
-        inner = self.inner.next_memory(self._inner(follower), leader, p, dt, speed)
+        inner = super().next_memory(follower, leader, p, dt, speed)
         own = torch.stack([held, jerk, residual, passed], -1)
         return torch.cat([inner, own], -1)
-
-    def initial_memory(self, speed: Tensor) -> Tensor:
-        own = torch.zeros((*speed.shape, _WIDTH), dtype=speed.dtype, device=speed.device)
-        return torch.cat([self.inner.initial_memory(speed), own], -1)
-
-    def _inner(self, follower: Follower) -> Follower:
-        """Returns the follower as the inner model knows it."""
-        return follower._replace(memory=follower.memory[..., : self.inner.memory_size])
 
     def _remembered(self, follower: Follower, column: int, at_start: Tensor) -> Tensor:
         """Returns what a column of the memory holds, `(*batch,)`, or this in the first step."""
@@ -220,3 +332,31 @@ def _braked(both: Tensor, alone: Tensor, follower: Follower, leader: Leader) -> 
     most = torch.maximum(alone, -needed)
     bounded = torch.where(needed > _HARD, torch.minimum(both, most), both)
     return torch.where((gap < _TIGHT_M) & (difference >= 0.0), no_more, bounded)
+
+
+LIMIT = "speed_limit"
+"""Name of the limit among the values that the model is given, m/s; infinity: there is none."""
+
+COMFORTABLE = 2.0
+"""m/s2: how hard a driver brakes who is faster than the limit."""
+
+
+class WithSpeedLimit(Composed):
+    """Any driving model that has equations, with a speed limit that comes with its parameters.
+
+    Where a driver would be faster than the limit they slow down to it at a comfortable
+    deceleration, and react to their leader as without it. The limit is no parameter: it is of the
+    road, and changes where a vehicle drives (`LIMIT` in what `next_speed` is given).
+
+    Args:
+        model: the inner model.
+    """
+
+    reference = "the smaller of the model's speed and of a speed limit"
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        wanted = self.inner.next_speed(follower, leader, p, dt)
+        slowed = follower.speed - COMFORTABLE * dt
+        return torch.minimum(wanted, torch.maximum(p[LIMIT], slowed))

@@ -1,0 +1,310 @@
+"""Objectives: how far a simulated trajectory is from the measured one.
+
+An objective is a pure function in two parts. `terms` says what each frame contributes, `finish`
+turns the sums over frames into the loss. The sums can therefore be accumulated frame by frame while
+a rollout is running, in a compiled step as well, without keeping the trajectory.
+
+Shapes: K frames, any batch of trajectories. All tensors broadcast against each other.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import ClassVar, Literal, NamedTuple, Self
+
+import torch
+from pydantic import Field, model_validator
+from torch import Tensor
+from torch.nn.functional import huber_loss
+
+from cfx.core.component import Component, Settings
+
+Signal = Literal["speed", "gap"]
+
+
+class FrameValues(NamedTuple):
+    """Simulated and recorded values: one frame `(*batch,)`, or many with a dimension of time.
+
+    A signal that the objective does not list in `signals` may be NaN or have another shape.
+
+    Attributes:
+        speed: simulated speed of the follower, m/s.
+        gap: simulated gap, bumper to bumper, m; negative after a collision.
+        measured_speed: measured speed of the follower, m/s.
+        measured_gap: measured gap, bumper to bumper, m.
+        dt: time step, s.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    measured_speed: Tensor
+    measured_gap: Tensor
+    dt: float
+
+
+class Objective(Component):
+    """Base of every objective.
+
+    Life cycle: a job makes one objective. Calibration minimises it for the driver-specific
+    parameters, for the pooled ones and for those of each window; closed-loop training minimises its
+    mean over trajectories by gradient. Both call the object itself, or `sums` and `finish`.
+
+    A subclass implements `terms` and `finish`: pure functions of tensors without Python branches on
+    their values, on any device, in float32 and float64, differentiable wherever the loss is.
+    `cfx.contracts.objectives` tests all this.
+
+    Punzo, Zheng and Montanino (2021), *About calibration of car-following dynamics of automated and
+    human-driven vehicles: Methodology, guidelines and codes*, Transportation Research Part C, find
+    that errors of spacing identify parameters better than errors of speed.
+
+    Attributes:
+        unit: the loss's unit, such as "m/s"; "" for a loss without unit.
+        signals: the signals that `terms` reads; the others are not computed for it.
+        tie_tolerance: losses of a window that differ by less, in `unit`, count as equal where
+            `windows.tie_tolerance` is null: about the accuracy of recorded trajectories.
+        floor: a small loss, in `unit`. Training that divides a loss by that of constant parameters
+            adds it to the divisor, so that a trajectory which these parameters follow almost
+            perfectly does not outweigh all others.
+    """
+
+    kind = "objective"
+    unit: ClassVar[str]
+    signals: Sequence[Signal] = ("speed", "gap")
+    tie_tolerance: ClassVar[float] = 0.0
+    floor: ClassVar[float] = 0.0
+
+    @abstractmethod
+    def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
+        """Returns what each frame contributes.
+
+        Args:
+            frames: one frame `(*batch,)` or many, such as `(K, *batch)`.
+
+        Returns:
+            A tuple of the same length in every call, of tensors that broadcast to the frames'
+            shape.
+        """
+
+    @abstractmethod
+    def finish(self, sums: tuple[Tensor, ...], count: Tensor, epsilon: float = 0.0) -> Tensor:
+        """Returns the loss `(*batch,)` of trajectories, never negative.
+
+        Args:
+            sums: each term, summed over the frames that count; `(*batch,)` or broadcasting to it.
+            count: number of frames that count, at least 1, broadcasting to `(*batch,)`.
+            epsilon: added to every mean square before its root is taken, in the square of the
+                signal's unit; above 0 the slope is finite at a perfect simulation too. With 0
+                the loss is exact.
+        """
+
+    def sums(self, frames: FrameValues, counted: Tensor, *, dim: int = 0) -> tuple[Tensor, ...]:
+        """Returns each term summed over time; the sums of parts of a trajectory may be added up.
+
+        Args:
+            frames: many frames.
+            counted: 1 (or True) for frames that count and 0 for others, broadcasting to the frames.
+            dim: the dimension of time, of the frames and of `counted` alike.
+        """
+        total = []
+        for term in self.terms(frames):
+            total.append((term * counted).sum(dim))
+        return tuple(total)
+
+    def __call__(
+        self, frames: FrameValues, counted: Tensor, *, dim: int = 0, epsilon: float = 0.0
+    ) -> Tensor:
+        """Returns the loss `(*batch,)` of full trajectories, in `unit`; 0 where no frame counts.
+
+        Args:
+            frames: many frames, such as `(K, *batch)`.
+            counted: 1 (or True) for frames that count and 0 for others, broadcasting to the frames.
+                Values of frames that do not count must be finite.
+            dim: the dimension of time, of the frames and of `counted` alike.
+            epsilon: see `finish`.
+        """
+        count = counted.sum(dim).clamp(min=1)
+        return self.finish(self.sums(frames, counted, dim=dim), count, epsilon)
+
+    def worded(self, loss: float) -> str:
+        """Returns a loss with its unit, for people."""
+        return f"{loss:.3g} {self.unit}".rstrip()
+
+
+def root_mean_square(total: Tensor, count: Tensor, epsilon: float = 0.0) -> Tensor:
+    """Returns the root of the mean square.
+
+    Args:
+        total: sum of squares over the frames that count.
+        count: number of these frames.
+        epsilon: added to the mean square.
+    """
+    return (total / count + epsilon).sqrt()
+
+
+def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
+    """Returns the ratio of tensors that are not negative, and 0 where both are 0."""
+    return numerator / denominator.masked_fill(denominator == 0, 1.0)
+
+
+class SpeedRmse(Objective):
+    """Root mean squared error of speed, m/s: the paper's objective."""
+
+    unit = "m/s"
+    signals = ("speed",)
+    tie_tolerance = 0.05
+    floor = 0.2
+
+    def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
+        return ((frames.speed - frames.measured_speed).square(),)
+
+    def finish(self, sums: tuple[Tensor, ...], count: Tensor, epsilon: float = 0.0) -> Tensor:
+        return root_mean_square(sums[0], count, epsilon)
+
+
+class GapRmse(Objective):
+    """Root mean squared error of the gap, m.
+
+    It identifies parameters better than an error of speed, because it keeps what an error of speed
+    has added up to (Punzo et al. 2021, see `Objective`).
+    """
+
+    unit = "m"
+    signals = ("gap",)
+    tie_tolerance = 0.05
+    floor = 1.0
+
+    def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
+        return ((frames.gap - frames.measured_gap).square(),)
+
+    def finish(self, sums: tuple[Tensor, ...], count: Tensor, epsilon: float = 0.0) -> Tensor:
+        return root_mean_square(sums[0], count, epsilon)
+
+
+class SpeedHuberSettings(Settings):
+    """Settings of `SpeedHuber`."""
+
+    delta: float = Field(
+        1.0, gt=0, description="m/s: larger errors count in proportion, not squared"
+    )
+
+
+class SpeedHuber(Objective):
+    """Root of twice the mean Huber loss of speed, m/s: large errors weigh less than in an RMSE.
+
+    P. J. Huber (1964), *Robust estimation of a location parameter*, Annals of Mathematical
+    Statistics 35.
+
+    An error up to `delta` counts squared, as in `speed_rmse`; a larger one counts
+    `delta (2 |error| - delta)`. Without larger errors the loss is the root mean squared error.
+    """
+
+    schema: ClassVar[type[Settings]] = SpeedHuberSettings
+    settings: SpeedHuberSettings
+    unit = "m/s"
+    signals = ("speed",)
+    tie_tolerance = 0.05
+    floor = 0.2
+
+    def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
+        error = frames.speed - frames.measured_speed
+        losses = huber_loss(
+            error, torch.zeros_like(error), reduction="none", delta=self.settings.delta
+        )
+        return (2.0 * losses,)
+
+    def finish(self, sums: tuple[Tensor, ...], count: Tensor, epsilon: float = 0.0) -> Tensor:
+        return root_mean_square(sums[0], count, epsilon)
+
+
+_LEAST_RMS = 1.0
+"""m/s and m: a measured signal with a smaller RMS counts as this large. A driver who stands has a
+speed of 0, by which no error can be divided."""
+
+
+class MixedSettings(Settings):
+    """Settings of `Mixed`."""
+
+    speed_weight: float = Field(1.0, ge=0, description="weight of the normalised error of speed")
+    gap_weight: float = Field(1.0, ge=0, description="weight of the normalised error of the gap")
+
+    @model_validator(mode="after")
+    def _some_weight(self) -> Self:
+        if self.speed_weight == 0 and self.gap_weight == 0:
+            raise ValueError(
+                "objective.speed_weight=0 and objective.gap_weight=0 leave nothing to minimise;"
+                " give one of them a positive value"
+            )
+        return self
+
+
+class Mixed(Objective):
+    """Weighted sum of the normalised errors of speed and gap, without unit.
+
+    Each part is a root mean squared error divided by the root mean square of the measured signal
+    (at least 1 m/s or 1 m): `w_v RMSE(v) / RMS(v_measured) + w_s RMSE(s) / RMS(s_measured)`.
+    """
+
+    schema: ClassVar[type[Settings]] = MixedSettings
+    settings: MixedSettings
+    unit = ""
+    tie_tolerance = 0.01
+    floor = 0.04
+
+    def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
+        return (
+            (frames.speed - frames.measured_speed).square(),
+            (frames.gap - frames.measured_gap).square(),
+            frames.measured_speed.square(),
+            frames.measured_gap.square(),
+        )
+
+    def finish(self, sums: tuple[Tensor, ...], count: Tensor, epsilon: float = 0.0) -> Tensor:
+        speed_errors, gap_errors, speeds, gaps = sums
+        speed_part = root_mean_square(speed_errors, count, epsilon) / _scale(speeds, count)
+        gap_part = root_mean_square(gap_errors, count, epsilon) / _scale(gaps, count)
+        return self.settings.speed_weight * speed_part + self.settings.gap_weight * gap_part
+
+
+def _scale(squares: Tensor, count: Tensor) -> Tensor:
+    """Returns the measured signal's RMS, at least `_LEAST_RMS`."""
+    return root_mean_square(squares, count).clamp(min=_LEAST_RMS)
+
+
+class TheilUSettings(Settings):
+    """Settings of `TheilU`."""
+
+    signal: Signal = Field("speed", description="what is compared: speed or gap")
+
+
+class TheilU(Objective):
+    """Theil's U: an error between 0 (perfect) and 1, without unit.
+
+    The root mean squared error, divided by the sum of the root mean squares of the simulated and of
+    the measured signal: `U = RMSE / (RMS_simulated + RMS_measured)`, Theil's form of 1961
+    (*Economic Forecasts and Policy*, North-Holland). U is 0 where both signals are 0.
+    """
+
+    schema: ClassVar[type[Settings]] = TheilUSettings
+    settings: TheilUSettings
+    unit = ""
+    tie_tolerance = 0.0025
+    floor = 0.01
+
+    @property
+    def signals(self) -> Sequence[Signal]:  # type: ignore[override]  # it follows from the settings
+        return (self.settings.signal,)
+
+    def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
+        simulated, measured = frames.speed, frames.measured_speed
+        if self.settings.signal == "gap":
+            simulated, measured = frames.gap, frames.measured_gap
+        return (simulated - measured).square(), simulated.square(), measured.square()
+
+    def finish(self, sums: tuple[Tensor, ...], count: Tensor, epsilon: float = 0.0) -> Tensor:
+        errors, simulated, measured = sums
+        error = root_mean_square(errors, count, epsilon)
+        size = root_mean_square(simulated, count, epsilon) + root_mean_square(
+            measured, count, epsilon
+        )
+        return ratio(error, size)

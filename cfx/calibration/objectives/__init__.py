@@ -1,1 +1,0 @@
-"""Objectives: what calibration minimises and what closed-loop training back-propagates."""

@@ -1,1 +1,0 @@
-"""Optimizers: many independent bounded problems at once."""
