@@ -20,8 +20,8 @@ import lightning.pytorch as pl
 import pandas as pd
 import torch
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
-from lightning.pytorch.callbacks import ModelCheckpoint
 from torch import Tensor
+from torch.utils.data import DataLoader
 
 from cfx.core.files import atomic_write
 from cfx.core.threads import one_thread
@@ -44,8 +44,15 @@ class Training(Protocol):
     def patience(self) -> int | None: ...
 
 
+_KEPT = ("best", "best_loss", "stale", "rows")
+"""What a checkpoint holds of a module beside what Lightning does."""
+
+
 class BatchedModule(pl.LightningModule):
     """Trains N networks and keeps the weights of each one's best epoch.
+
+    A subclass says what a batch and a step are (`train_dataloader`, `training_step`), and ends an
+    epoch by `judge` in `validation_step`.
 
     Args:
         network: the networks; `ensemble_size` of them, behind one another, share a name.
@@ -75,7 +82,8 @@ class BatchedModule(pl.LightningModule):
         self.network = network
         self.names = names
         self.ensemble_size = ensemble_size
-        self.training_settings = settings
+        self.settings = settings
+        self.automatic_optimization = False
         self.on_epoch = on_epoch
         self.best: dict[str, Tensor] = {}
         for key, value in network.named_parameters():
@@ -84,8 +92,13 @@ class BatchedModule(pl.LightningModule):
         self.stale = torch.zeros(networks, dtype=torch.int64)
         self.rows: list[tuple[Tensor, Tensor]] = []
 
+    def val_dataloader(self) -> DataLoader[Any]:
+        """Returns one batch, so that an epoch is validated once."""
+        once: Any = [0]
+        return DataLoader(once, batch_size=None)
+
     def configure_optimizers(self) -> Any:
-        s = self.training_settings
+        s = self.settings
         parameters = self.network.parameters()
         return torch.optim.AdamW(
             parameters, lr=s.learning_rate, weight_decay=s.weight_decay, fused=self.fused
@@ -93,8 +106,8 @@ class BatchedModule(pl.LightningModule):
 
     def configure_gradient_clipping(self, optimizer: Any, *args: Any, **kwargs: Any) -> None:
         """Clips each network's gradient on its own: a norm over all would couple them."""
-        if self.training_settings.gradient_clip is not None:
-            clip_each(self.network, self.training_settings.gradient_clip)
+        if self.settings.gradient_clip is not None:
+            clip_each(self.network, self.settings.gradient_clip)
 
     def judge(self, train: Tensor, validation: Tensor, *, hopeful: bool = False) -> None:
         """Ends an epoch.
@@ -109,7 +122,7 @@ class BatchedModule(pl.LightningModule):
         """
         self.rows.append((train, validation))
         loss = torch.where(validation.isnan(), train, validation)
-        patience = self.training_settings.patience
+        patience = self.settings.patience
         active = torch.ones_like(self.stale, dtype=torch.bool)
         if patience is not None:
             active = self.stale < patience
@@ -134,19 +147,12 @@ class BatchedModule(pl.LightningModule):
                 value.copy_(self.best[key])
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        checkpoint["batched"] = {
-            "best": self.best,
-            "best_loss": self.best_loss,
-            "stale": self.stale,
-            "rows": self.rows,
-        }
+        checkpoint["batched"] = {name: getattr(self, name) for name in _KEPT}
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        kept = checkpoint["batched"]
-        self.best, self.best_loss, self.stale = dict(kept["best"]), kept["best_loss"], kept["stale"]
-        self.rows.clear()
-        for train, validation in kept["rows"]:
-            self.rows.append((train, validation))
+        for name in _KEPT:
+            setattr(self, name, checkpoint["batched"][name])
+        for _ in self.rows:
             self.on_epoch()
 
     def curves(self) -> pd.DataFrame:
@@ -183,19 +189,12 @@ def clip_each(network: PolicyNetwork, largest: float) -> None:
 
 
 def fit(
-    module: BatchedModule,
-    data: pl.LightningDataModule,
-    *,
-    epochs: int,
-    seed: int,
-    device: torch.device,
-    checkpoint: Path | None = None,
+    module: BatchedModule, epochs: int, seed: int, device: torch.device, checkpoint: Path | None
 ) -> None:
     """Trains with Lightning, quietly, and puts the best weights back.
 
     Args:
         module: what is trained.
-        data: its batches.
         epochs: at most.
         seed: of the global generator, from which dropout draws.
         device: where.
@@ -203,11 +202,7 @@ def fit(
             training that ended gives the same at once. None: no such file.
     """
     is_gpu = device.type == "cuda"
-    devices = [device] if is_gpu else []
-    callbacks: list[pl.Callback] = []
-    if checkpoint is not None:
-        callbacks.append(EveryEpoch(checkpoint))
-    with torch.random.fork_rng(devices=devices):
+    with torch.random.fork_rng(devices=[device] if is_gpu else []):
         torch.manual_seed(seed)
         with warnings.catch_warnings(), one_thread(), _quiet_lightning():
             warnings.filterwarnings("ignore", module=r"lightning\.")
@@ -219,17 +214,27 @@ def fit(
                 accelerator="gpu" if is_gpu else "cpu",
                 devices=1,
                 logger=False,
-                callbacks=callbacks,
+                callbacks=[] if checkpoint is None else [EveryEpoch(checkpoint)],
                 # Jobs in a queue of Slurm are no parts of one training on many machines.
                 plugins=[LightningEnvironment()],
-                enable_checkpointing=checkpoint is not None,
+                enable_checkpointing=False,
                 enable_model_summary=False,
                 enable_progress_bar=False,
                 num_sanity_val_steps=0,
                 # Nothing random happens between batches, and they must come in order.
                 use_distributed_sampler=False,
             )
-            _run(trainer, module, data, checkpoint)
+            start = None
+            if checkpoint is not None and checkpoint.is_file():
+                start = checkpoint
+                log.info("Training goes on from %s", checkpoint)
+            try:
+                trainer.fit(module, ckpt_path=start, weights_only=True)
+            except SystemExit as error:
+                # Lightning turns Ctrl-C into an exit.
+                if isinstance(error.__context__, KeyboardInterrupt):
+                    raise KeyboardInterrupt from None
+                raise
     module.restore_best()
     module.network.to(device).eval()
 
@@ -248,39 +253,13 @@ def _quiet_lightning() -> Iterator[None]:
             logger.setLevel(level)
 
 
-class EveryEpoch(ModelCheckpoint):
+class EveryEpoch(pl.Callback):
     """Writes one checkpoint atomically after every epoch."""
 
     def __init__(self, path: Path) -> None:
-        super().__init__(save_top_k=0)
         self.path = path
-
-    def on_validation_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
-        """Waits for the end of the epoch."""
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(self.path) as temporary:
             trainer.save_checkpoint(temporary)
-
-
-def _run(
-    trainer: pl.Trainer,
-    module: BatchedModule,
-    data: pl.LightningDataModule,
-    checkpoint: Path | None,
-) -> None:
-    """Fits, from the checkpoint if there is one.
-
-    Lightning turns Ctrl-C into an exit; here it stays a KeyboardInterrupt.
-    """
-    start = None
-    if checkpoint is not None and checkpoint.is_file():
-        start = checkpoint
-        log.info("Training goes on from %s", checkpoint)
-    try:
-        trainer.fit(module, datamodule=data, ckpt_path=start, weights_only=True)
-    except SystemExit as error:
-        if isinstance(error.__context__, KeyboardInterrupt):
-            raise KeyboardInterrupt from None
-        raise

@@ -1,77 +1,203 @@
-"""The Lightning module of imitation: gradient steps on segments of windows, and validation.
+"""Training of imitation: its data on networks, gradient steps on segments of windows, validation.
 
-Shapes: N networks, B trajectories of the network that has most, S windows of a segment, f features
-of a token, c features of conditioning, n tuned parameters, s width of the policy's state.
+Importing this imports Lightning, which takes seconds and 100 MB.
+
+Shapes: P pairs, N networks, B trajectories of the network that has most, W windows, S windows of a
+segment, f features of a token, c features of conditioning, n tuned parameters, s width of the
+policy's state.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
-import lightning.pytorch as pl
 import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from cfx.learners.batched import BatchedModule
-from cfx.learners.imitation_data import ImitationDataset, ImitationSettings
-from cfx.policies.base import PolicyNetwork
+from cfx.core.errors import DataError
+from cfx.learners.base import TrainingData
+from cfx.learners.batched import BatchedModule, Training
+from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.features import Scaler, measured_history, tokens
 from cfx.policies.heads.base import ParameterHead
+from cfx.policies.placement import Grid
 from cfx.simulation.kernel.compiler import torch_compiled
-from cfx.simulation.rollout import can_compile
-
-_WORTH_COMPILING = 20_000
-"""Gradient steps from which compiling pays: some ten seconds of eager work."""
 
 
-class SegmentData(pl.LightningDataModule):
-    """Segments of consecutive windows, in order: pairs of first window and end.
+class _Rows(NamedTuple):
+    """The R trajectories that networks learn from: one for each pair and base.
+
+    Attributes:
+        pair: `(R,)`.
+        network: `(R,)`.
+        base: in unit space, `(R, n)`, single precision.
+    """
+
+    pair: Tensor
+    network: Tensor
+    base: Tensor
+
+
+def _rows(training_data: TrainingData, head: ParameterHead) -> _Rows:
+    """Returns each pair with its base, and with the pooled one where that is another."""
+    device = training_data.device
+    pair = torch.arange(len(training_data.pairs), device=device)
+    network = training_data.pairs.network.to(device)
+    pooled, own = training_data.pairs.fixed, training_data.pairs.base
+    unit_pooled = head.space.to_unit(pooled).float()
+    if own is None or not head.needs_base or torch.equal(own, pooled):
+        return _Rows(pair, network, unit_pooled)
+    unit_own = head.space.to_unit(own).float()
+    return _Rows(pair.repeat(2), network.repeat(2), torch.cat([unit_own, unit_pooled]))
+
+
+class ImitationDataset(NamedTuple):
+    """Training tensors as N networks by B trajectories by W windows.
+
+    Attributes:
+        scaler: normalises features.
+        features: token and conditioning, normalised, `(N, B, W, f + c)`.
+        labels: in the head's unit space, `(N, B, W, n)`.
+        base: in unit space, `(N, B, n)`.
+        train_weight, validation_weight: `(N, B, W)`.
+    """
+
+    scaler: Scaler
+    features: Tensor
+    labels: Tensor
+    base: Tensor
+    train_weight: Tensor
+    validation_weight: Tensor
+
+    @property
+    def windows(self) -> int:
+        """W."""
+        return self.features.shape[2]
+
+    @classmethod
+    def of(
+        cls,
+        policy: Policy,
+        training_data: TrainingData,
+        head: ParameterHead,
+        validation: float,
+        *,
+        weighs: bool,
+    ) -> ImitationDataset:
+        """Places training data.
+
+        Args:
+            policy: says what networks read.
+            training_data: with labels.
+            head: makes parameters of answers.
+            validation: share of each pair's windows, the last ones, that is kept for validation.
+            weighs: whether windows weigh by the sensitivity of their loss.
+
+        Raises:
+            DataError: a pair has too few windows to keep some for validation.
+        """
+        labels, pairs = training_data.pairs.labels, len(training_data.pairs)
+        if labels is None:
+            raise TypeError("imitation needs labels: the parameters calibrated for each window")
+        windows, device = labels.windows, training_data.device
+        pair, first = windows.pair.to(device), windows.first.to(device)
+        recorded = training_data.pairs.index.to(device)[pair]
+        length = training_data.windows.length
+        history = measured_history(training_data.recorded, recorded, first, length)
+        seen = tokens(history, policy.inputs, policy.summary).float()
+        unit = head.space.to_unit(labels.parameters).float()
+        tokens_of_pairs, mask = windows.to_grid(seen, pairs)
+        labels_of_pairs, _ = windows.to_grid(unit, pairs)
+        sensitivity, _ = windows.to_grid(labels.sensitivity.float(), pairs)
+        train = _training_windows(mask, validation)
+        weight = torch.ones_like(sensitivity)
+        if weighs:
+            weight = _sensitivity_weight(sensitivity, train)
+        rows = _rows(training_data, head)
+        grid = Grid(rows.network, len(training_data.names))
+        conditioning = head.condition(rows.base)[:, None].expand(-1, mask.shape[1], -1)
+        features = grid.scatter(torch.cat([tokens_of_pairs[rows.pair], conditioning], -1))
+        scaler = Scaler.of(features, grid.scatter(train[rows.pair]))
+        return cls(
+            scaler=scaler,
+            features=scaler(features),
+            labels=grid.scatter(labels_of_pairs[rows.pair]),
+            base=grid.scatter(rows.base),
+            train_weight=grid.scatter((weight * train)[rows.pair]),
+            validation_weight=grid.scatter((weight * (mask & ~train))[rows.pair]),
+        )
+
+
+def _training_windows(mask: Tensor, validation: float) -> Tensor:
+    """Returns the windows that are trained on: all but each pair's last ones, bool `(P, W)`.
+
+    Args:
+        mask: windows that there are, bool `(P, W)`.
+        validation: share that is kept for validation; above 0 at least one window is.
+
+    Raises:
+        DataError: nothing is left of a pair.
+    """
+    counts = mask.sum(1)
+    kept = (counts * validation).round().long()
+    if validation > 0:
+        kept = kept.clamp(min=1)
+    if bool((counts - kept < 1).any()):
+        raise DataError(
+            f"a pair has only {int(counts.min())} training windows, too few to keep {validation:g}"
+            " of them for validation; raise data.min_frames or set learner.validation=0"
+        )
+    number = torch.arange(mask.shape[1], device=mask.device)
+    return mask & (number < (counts - kept)[:, None])
+
+
+def _sensitivity_weight(sensitivity: Tensor, train: Tensor) -> Tensor:
+    """Returns weights `(P, W)` in proportion to the sensitivity of each window's loss.
+
+    Their mean is 1 over each pair's training windows; they are ones if all sensitivities are 0.
+    """
+    count = train.sum(1, keepdim=True)
+    mean = (sensitivity * train).sum(1, keepdim=True) / count
+    tiny = torch.finfo(sensitivity.dtype).tiny
+    return torch.where(mean > 0, sensitivity / mean.clamp(min=tiny), 1.0)
+
+
+class ImitationModule(BatchedModule):
+    """Trains N networks on segments of consecutive windows, a gradient step for each segment.
 
     A training batch is all segments of an epoch: a gradient step is so short that Lightning's own
     work around it would be a third of it.
     """
-
-    def __init__(self, windows: int, batch_size: int | None) -> None:
-        super().__init__()
-        size = batch_size or windows
-        self.windows = windows
-        self.segments: list[tuple[int, int]] = []
-        for first in range(0, windows, size):
-            self.segments.append((first, min(first + size, windows)))
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        epoch: Any = [self.segments]
-        return DataLoader(epoch, batch_size=None, shuffle=False)
-
-    def val_dataloader(self) -> DataLoader[Any]:
-        whole: Any = [(0, self.windows)]
-        return DataLoader(whole, batch_size=None)
-
-
-class ImitationModule(BatchedModule):
-    """Trains N networks on their segments, a gradient step for each."""
 
     fused = True
 
     def __init__(
         self,
         network: PolicyNetwork,
+        names: tuple[str, ...],
+        settings: Training,
         dataset: ImitationDataset,
         head: ParameterHead,
-        settings: ImitationSettings,
-        names: tuple[str, ...],
-        on_epoch: Callable[[], None] = lambda: None,
+        batch_size: int | None,
+        on_epoch: Callable[[], None],
     ) -> None:
         super().__init__(network, names, settings, on_epoch)
-        self.automatic_optimization = False
-        self.dataset = dataset
-        self.head = head
-        self.train_loss = torch.zeros(len(names))
-        if _is_worth_compiling(settings, dataset):
-            # The compiled function takes the method's place.
-            self.segment_error = torch_compiled(self.segment_error, dynamic=False)  # type: ignore[method-assign]
+        self.dataset, self.head = dataset, head
+        size = batch_size or dataset.windows
+        self.segments = []
+        for first in range(0, dataset.windows, size):
+            self.segments.append((first, min(first + size, dataset.windows)))
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        epoch: Any = [self.segments]
+        return DataLoader(epoch, batch_size=None)
+
+    def compile_step(self) -> None:
+        """Compiles the error of a segment; the compiled function takes the method's place."""
+        self.segment_error = torch_compiled(self.segment_error, dynamic=False)  # type: ignore[method-assign]
 
     def training_step(self, segments: list[tuple[int, int]], index: int) -> None:
         dataset, optimizer = self.dataset, self.optimizers(use_pl_optimizer=False)
@@ -79,8 +205,7 @@ class ImitationModule(BatchedModule):
         networks, drivers = dataset.features.shape[:2]
         state = self.network.initial_state(networks, drivers)
         base = dataset.base[:, :, None]
-        errors, weights = torch.zeros_like(self.train_loss), torch.zeros_like(self.train_loss)
-        errors, weights = errors.to(base.device), weights.to(base.device)
+        errors, weights = base.new_zeros(networks), base.new_zeros(networks)
         for first, last in segments:
             windows = slice(first, last)
             weight = dataset.train_weight[:, :, windows]
@@ -97,7 +222,7 @@ class ImitationModule(BatchedModule):
             weights += total
         self.train_loss = (errors / weights.clamp(min=1e-9)).cpu()
 
-    def validation_step(self, segment: tuple[int, int], index: int) -> None:
+    def validation_step(self, number: int, index: int) -> None:
         dataset = self.dataset
         networks, drivers = dataset.features.shape[:2]
         state = self.network.initial_state(networks, drivers)
@@ -132,10 +257,3 @@ class ImitationModule(BatchedModule):
         """Returns each network's weighted sum of squared errors, `(N,)`; mean over parameters."""
         unit = self.head.unit_parameters(answer, base)
         return ((unit - labels).square().mean(-1) * weight).sum((1, 2))
-
-
-def _is_worth_compiling(settings: ImitationSettings, dataset: ImitationDataset) -> bool:
-    if settings.compile == "never" or not can_compile(dataset.base.device):
-        return False
-    steps = settings.epochs * -(-dataset.windows // (settings.batch_size or dataset.windows))
-    return settings.compile == "always" or steps >= _WORTH_COMPILING

@@ -10,7 +10,6 @@ would have to. `extra_info` holds the ratios of their times; nothing passes or f
 from __future__ import annotations
 
 import time
-from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -21,15 +20,15 @@ from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.learners.rollout import RolloutSettings
 from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.module import RolloutModule
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.gru import GruPolicy
-from cfx.policies.heads.offset import NONE
+from cfx.policies.heads.offset import NONE, OffsetHead
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, WindowSettings
 from tests.drives import wavy_pairs
+from tests.learners.made import module_with
 
 NETWORKS, DRIVERS, FRAMES = 6, 57, 700
 POLICY = GruPolicy(
@@ -63,20 +62,13 @@ class Step:
         self, model: DrivingModel, settings: RolloutSettings, networks: int = NETWORKS
     ) -> None:
         training_data = _training_data(model, networks)
-        dataset = RolloutDataset.of(
-            training_data,
-            POLICY,
-            settings.validation,
-            torch.Generator().manual_seed(0),
-            settings.ensemble_size,
-        )
+        head, generator = OffsetHead.for_model(model), torch.Generator().manual_seed(0)
+        dataset = RolloutDataset.of(training_data, POLICY, head, settings, generator)
         blank = torch.full((len(dataset.pair), len(model.space)), NONE)
         width = dataset.scaler.mean.shape[-1]
         network = POLICY.build(width, blank[0], blank, torch.Generator().manual_seed(0))
-        self.module = RolloutModule(
-            network, dataset, POLICY, replace(training_data, workspace=None), settings
-        )
-        self.optimizer = torch.optim.AdamW(network.parameters(), lr=1e-3)
+        self.module = module_with(network, dataset, training_data, settings, POLICY)
+        self.optimizer = torch.optim.AdamW(self.module.network.parameters(), lr=1e-3)
         self.number = 0
 
     @one_thread()

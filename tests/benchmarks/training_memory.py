@@ -13,6 +13,7 @@ from dataclasses import replace
 import torch
 
 from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.settings import RolloutSettings
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class
 from tests.learners.made import training_data
@@ -35,7 +36,8 @@ def main(count: int) -> None:
     data = replace(data, recorded=data.recorded[copies], pairs=pairs, names=("all",))
     head = head_class("offset").for_model(data.simulator.model)
     before = _most()
-    dataset = RolloutDataset.of(data, GruPolicy(inputs="situation"), 0.25, generator, 2, head)
+    settings = RolloutSettings(ensemble_size=2)
+    dataset = RolloutDataset.of(data, GruPolicy(inputs="situation"), head, settings, generator)
     dataset.only(slice(0, 1))
     print(f"{count} pairs: {before:.0f} MB before, at most {_most() - before:.0f} MB more")
 

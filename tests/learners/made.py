@@ -14,12 +14,13 @@ from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import ClosedLoop, Followers, simulate_closed_loop
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
-from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.inputs import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
+from cfx.learners.rollout.loss import BaseErrors
 from cfx.learners.rollout.module import RolloutModule
+from cfx.learners.rollout.shard import TrainingShard
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
-from cfx.policies.base import Policy
+from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.core import AgentCore
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class, head_name
@@ -133,25 +134,38 @@ def placed(
     share: float = 0.25,
     seed: int = 0,
     head: str = "offset",
+    ensemble_size: int = 1,
 ) -> RolloutDataset:
     """Returns the training data placed on networks."""
     generator = torch.Generator().manual_seed(seed)
     made = head_class(head).for_model(data.simulator.model)
-    return RolloutDataset.of(data, policy, share, generator, head=made)
+    settings = RolloutSettings(validation=share, ensemble_size=ensemble_size)
+    return RolloutDataset.of(data, policy, made, settings, generator)
+
+
+def module_with(
+    network: PolicyNetwork,
+    dataset: RolloutDataset,
+    data: TrainingData,
+    settings: RolloutSettings,
+    policy: Policy | None = None,
+) -> RolloutModule:
+    """Returns what trains a network on placed data."""
+    errors, weights = BaseErrors.of(data, dataset, settings.horizon), network.state_dict()
+    return RolloutModule(TrainingShard(settings, policy or gru(), data, dataset, errors, weights))
 
 
 def module_of(data: TrainingData, **options: Any) -> RolloutModule:
     """Returns a module whose networks answer at random, so that they do something."""
     policy, settings = gru(), RolloutSettings(**(QUICK | options))
     generator = torch.Generator().manual_seed(0)
-    dataset = RolloutDataset.of(
-        data, policy, settings.validation, generator, settings.ensemble_size
-    )
+    head = head_class(settings.head).for_model(data.simulator.model)
+    dataset = RolloutDataset.of(data, policy, head, settings, generator)
     blank = torch.full((len(dataset.pair), 2), 0.5)
     network = policy.build(dataset.scaler.mean.shape[-1], blank[0], blank, generator)
     with torch.no_grad():
         network.get_parameter("w_out").uniform_(-1.0, 1.0, generator=generator)
-    return RolloutModule(network, dataset, policy, data, settings)
+    return module_with(network, dataset, data, settings)
 
 
 def batch_of(

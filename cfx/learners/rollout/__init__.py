@@ -1,8 +1,8 @@
 """Learning through the simulation: the learner `rollout`.
 
-From the settings down: `learner` puts a training together, `shard` cuts it, `train` trains a part
-of it, and `module` takes gradient steps, for which `sampling` chooses trajectories of the
-`dataset`. `loop` simulates their `inputs` window by window (`window`), and `loss` judges them.
+From the settings down: `learner` puts a training together, `shard` cuts it, and `module` trains a
+part of it by gradient steps, for which `sampling` chooses trajectories of the `dataset`. `loop`
+simulates them window by window (`window`, or compiled: `scan`), and `loss` judges them.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ features, c = n + k features of conditioning.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -20,12 +20,11 @@ from cfx.core import scratch
 from cfx.core.parameters import squashed
 from cfx.data.pairs import SIGNALS, PairBatch
 from cfx.learners.base import TrainingData
-from cfx.learners.rollout.inputs import RolloutBatch
+from cfx.learners.rollout.settings import RolloutSettings
 from cfx.policies.base import Policy
 from cfx.policies.driver_features import measure
 from cfx.policies.features import Scaler, measured_history, tokens
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.heads.offset import OffsetHead
 from cfx.policies.placement import Grid
 
 _FEW_DRIVERS = 5
@@ -39,6 +38,54 @@ _STANDSTILL_M = 2.0
 _TIME_GAPS_S = (0.8, 2.5)
 """Above which speed a driver moves, which gap remains at standstill, and which time gaps are usual
 on motorways."""
+
+
+class RolloutBatch(NamedTuple):
+    """Trajectories to simulate, D for each of N networks.
+
+    Attributes:
+        place: which of the network's drivers, `(N, D)`.
+        start: window at whose beginning the policy takes over, `(N, D)`.
+        cold_start: whether nothing was observed before and the pooled parameters are the base, as
+            for an unseen driver; bool `(N, D)`.
+        last: the last frame that counts, `(N, D)`.
+        weight: `(N, D)`; 0 leaves a trajectory out.
+        scale: factor on all distances, speeds and accelerations, `(N, D)`; None: 1. It makes a
+            recording of another driver on another road.
+        shift: m/s added to the speeds of both vehicles, `(N, D)`; None: nothing. It makes a
+            recording of a faster road.
+        wider: m by which the gap is wider for that, `(N, D)`; given where `shift` is.
+    """
+
+    place: Tensor
+    start: Tensor
+    cold_start: Tensor
+    last: Tensor
+    weight: Tensor
+    scale: Tensor | None = None
+    shift: Tensor | None = None
+    wider: Tensor | None = None
+
+    @property
+    def row(self) -> Tensor:
+        """The network of each trajectory, `(N, 1)`: the first index of tables `(N, B, ...)`."""
+        return torch.arange(len(self.place), device=self.place.device)[:, None]
+
+    def each(self, change: Callable[[Tensor], Tensor]) -> RolloutBatch:
+        """Returns the trajectories with each table `(N, D)` changed alike."""
+        changed = {name: change(v) for name, v in self._asdict().items() if v is not None}
+        return self._replace(**changed)
+
+    def without_unweighted(self) -> RolloutBatch:
+        """Returns the trajectories that have weight, in order.
+
+        A network that has fewer of them than another is filled up with trajectories without weight.
+        """
+        has_weight = self.weight > 0
+        most = int(has_weight.sum(1).max())
+        order = has_weight.long().argsort(dim=1, descending=True, stable=True)
+        kept = order[:, :most].sort(1).values
+        return self.each(lambda values: values.gather(1, kept))
 
 
 class Conditioning(NamedTuple):
@@ -131,26 +178,21 @@ class RolloutDataset:
         cls,
         training_data: TrainingData,
         policy: Policy,
-        share: float,
+        head: ParameterHead,
+        settings: RolloutSettings,
         generator: torch.Generator,
-        ensemble_size: int = 1,
-        head: ParameterHead | None = None,
-        balance: float = 0.0,
     ) -> RolloutDataset:
         """Places training data.
 
         Args:
             training_data: what may be learned from.
             policy: says what networks read.
-            share: of the drivers that is kept for validation (of each trajectory's end, where
-                drivers are few).
-            generator: chooses these drivers, for each member of an ensemble anew.
-            ensemble_size: networks of an ensemble.
-            head: says which parameters bases have; None: those of the driving model.
-            balance: how evenly sites and drivers are sampled, from 0 to 1; see `chances`.
+            head: says which parameters bases have.
+            settings: how many networks an ensemble has, which drivers are kept for validation, and
+                how evenly drivers are sampled.
+            generator: chooses the drivers for validation, for each member of an ensemble anew.
         """
-        if head is None:
-            head = OffsetHead.for_model(training_data.simulator.model)
+        share, ensemble_size = settings.validation, settings.ensemble_size
         recorded, row = _recorded_once(training_data)
         batch = _single_precision(training_data.recorded, training_data.pairs.index[recorded])
         device = batch.lengths.device
@@ -191,7 +233,7 @@ class RolloutDataset:
             last=last,
             base=placed,
             pooled=pooled.repeat_interleave(ensemble_size, 0),
-            chance=_chance(training_data, pair, present, balance),
+            chance=_chance(training_data, pair, present, settings.balance),
             scaler=Scaler(
                 scaler.mean.repeat_interleave(ensemble_size, 0),
                 scaler.scale.repeat_interleave(ensemble_size, 0),
@@ -208,16 +250,12 @@ class RolloutDataset:
         recordings = self.recordings
         if len(rows) < len(recordings.pair):
             recordings = recordings[rows]
+        tables = ("trains", "validates", "until", "last", "base", "pooled")
         return replace(
             self,
+            **{name: getattr(self, name)[networks] for name in tables},
             recordings=recordings,
             pair=pair,
-            trains=self.trains[networks],
-            validates=self.validates[networks],
-            until=self.until[networks],
-            last=self.last[networks],
-            base=self.base[networks],
-            pooled=self.pooled[networks],
             chance=None if self.chance is None else self.chance[networks],
             scaler=Scaler(self.scaler.mean[networks], self.scaler.scale[networks]),
             part=Part(networks, len(self.pair)),
@@ -314,6 +352,26 @@ class RolloutDataset:
         places = torch.searchsorted(upto, draws, right=True)
         last = (chance > 0).long().cumsum(1).argmax(1, keepdim=True)
         return places.minimum(last).sort(1).values
+
+    def observed_windows(
+        self, batch: RolloutBatch, pair: Tensor, most: int | None
+    ) -> tuple[Tensor, Tensor]:
+        """Returns what was measured in windows before trajectories; nothing before a cold start.
+
+        Args:
+            batch: the trajectories.
+            pair: which pair each is of, `(N, D)`.
+            most: windows at most, the last ones before the start; None: all.
+
+        Returns:
+            Tokens `(B, N, D, f)`, and whether a trajectory has the window, bool `(B, N, D)`.
+        """
+        start = torch.where(batch.cold_start, 0, batch.start)
+        count = int(start.max())
+        if most is not None:
+            count = min(count, most)
+        windows = start - count + torch.arange(count, device=start.device)[:, None, None]
+        return self.recordings.tokens[pair, windows.clamp(min=0)], windows >= 0
 
     def condition(self, batch: RolloutBatch) -> Conditioning:
         """Returns what is known of the drivers of these trajectories.

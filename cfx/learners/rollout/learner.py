@@ -6,13 +6,14 @@ Here nothing is labelled: from random measured states on, the policy drives in c
 the measured leader, and the job's objective is propagated back through the simulation into the
 network.
 
-Shapes: N networks (each member of an ensemble counts), n tuned parameters.
+Shapes: N networks (each member of an ensemble counts), M networks of the ensemble that others begin
+as, n tuned parameters.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
@@ -21,8 +22,9 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from cfx.core import registry
 from cfx.core.component import Settings
-from cfx.core.engine import Engine
+from cfx.core.errors import ConfigError, DataError
 from cfx.core.progress import Task
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.learners.curves import warn_of_nothing_learned
@@ -31,7 +33,6 @@ from cfx.learners.rollout.sampling import Augmentation
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import (
     TrainedShard,
-    TrainingShard,
     checkpoint_path,
     cut,
     epochs,
@@ -40,13 +41,15 @@ from cfx.learners.rollout.shard import (
     shard_checkpoints,
     untrained,
 )
-from cfx.learners.rollout.start import begun, check_start, start_policy
 from cfx.learners.situations import learned_range
+from cfx.policies import checkpoint as saved
+from cfx.policies.agent import Agent
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.core import Ensemble
 from cfx.policies.features import Scaler
 from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
+from cfx.policies.ready import folder_of_ready_made, is_ready_made
 
 log = logging.getLogger(__name__)
 
@@ -113,55 +116,62 @@ class RolloutLearner(Learner):
             )
         generator = torch.Generator().manual_seed(training_data.seed)
         head = head_class(s.head).for_model(simulator.model)
-        dataset = RolloutDataset.of(
-            training_data, policy, s.validation, generator, s.ensemble_size, head, s.balance
-        )
+        dataset = RolloutDataset.of(training_data, policy, head, s, generator)
         network = untrained(policy, dataset, head, generator)
         start = None
         if s.start is not None:
             start = start_policy(s.start).to(training_data.device)
             check_start(s.start, start, policy, training_data, head)
             network, dataset = begun(start, network, dataset)
-        if not any(parameter.requires_grad for parameter in network.parameters()):
-            curves = pd.DataFrame(columns=CURVE_COLUMNS)
-            return self._result(network.eval(), dataset, training_data, curves)
-        checkpoint = self.checkpoint(policy, training_data)
-        networks = networks_of_shards(s, dataset)
-        shards = cut(s, policy, training_data, dataset, network, networks, checkpoint)
-        curves, dispersion = self._train(
-            shards, len(networks), training_data.engine, network, dataset
+        curves, dispersion = pd.DataFrame(columns=CURVE_COLUMNS), None
+        if any(parameter.requires_grad for parameter in network.parameters()):
+            curves, dispersion = self._train(policy, training_data, network, dataset)
+        augment = None
+        if training_data.pairs.base is not None and s.cold_start_fraction > 0:
+            generator = torch.Generator().manual_seed(training_data.seed)
+            augment = Augmentation(s, time_gaps(training_data), generator)
+        valid_range = learned_range(training_data, augment)
+        if start is not None and start.valid_range is not None:
+            valid_range = valid_range.joined(start.valid_range)
+        first = slice(None, None, s.ensemble_size)
+        if s.ensemble_size > 1:
+            network = Ensemble(network, s.ensemble_size)
+        return TrainingResult(
+            network=network.eval(),
+            scaler=Scaler(dataset.scaler.mean[first].clone(), dataset.scaler.scale[first].clone()),
+            curves=curves,
+            base=head.space.from_unit(dataset.pooled[first].to(training_data.pairs.fixed.dtype)),
+            head=head.name,
+            valid_range=valid_range,
+            dispersion=dispersion,
         )
-        for file in shard_checkpoints(checkpoint, networks):
-            if file is not None:
-                file.unlink(missing_ok=True)
-                expert_checkpoint(file).unlink(missing_ok=True)
-        found = self._result(network.eval(), dataset, training_data, curves)
-        if start is not None and start.valid_range is not None and found.valid_range is not None:
-            found = replace(found, valid_range=found.valid_range.joined(start.valid_range))
-        return replace(found, dispersion=dispersion)
 
     def _train(
         self,
-        shards: Iterable[TrainingShard],
-        count: int,
-        engine: Engine,
+        policy: Policy,
+        training_data: TrainingData,
         network: PolicyNetwork,
         dataset: RolloutDataset,
     ) -> tuple[pd.DataFrame, Tensor | None]:
-        """Trains all networks in place, in `count` shards.
+        """Trains all networks in place, in shards.
 
         Returns:
             The learning curves, and the dispersion of each ensemble's noise; None for a head
             without noise.
         """
-        at_most = epochs(self.settings)
         # Where nothing is trained, its imports would only take time and memory.
-        from cfx.learners.rollout.train import train
+        from cfx.learners.rollout.module import train
 
+        s = self.settings
+        checkpoint = checkpoint_path(self.identity(), policy, training_data)
+        networks = networks_of_shards(s, dataset)
+        files = shard_checkpoints(checkpoint, networks)
+        shards = cut(s, policy, training_data, dataset, network, networks, files)
+        count, at_most = len(networks), epochs(s)
         title = f"Training ({len(dataset.pair)} networks, at most {at_most} epochs)"
         with Task(title, at_most * count) as task:
             trained: dict[int, TrainedShard] = dict(
-                engine.map(train, shards, task.advance, shares_cores=count == 1)
+                training_data.engine.map(train, shards, task.advance, shares_cores=count == 1)
             )
         in_order = [trained[number] for number in range(count)]
         weights = {}
@@ -171,58 +181,97 @@ class RolloutLearner(Learner):
         curves = pd.concat([found.curves for found in in_order], ignore_index=True)
         curves = curves.sort_values("epoch", kind="stable", ignore_index=True)
         warn_of_nothing_learned(curves)
-        factors = []
-        for found in in_order:
-            if found.dispersion is not None:
-                factors.append(found.dispersion)
+        factors = [found.dispersion for found in in_order if found.dispersion is not None]
         dispersion = None
         if factors:
             # The geometric mean of an ensemble's members.
-            of_members = torch.cat(factors).log().view(-1, dataset.ensemble_size)
-            dispersion = of_members.mean(1).exp()
+            dispersion = torch.cat(factors).log().view(-1, s.ensemble_size).mean(1).exp()
+        for file in files:
+            if file is not None:
+                file.unlink(missing_ok=True)
+                expert_checkpoint(file).unlink(missing_ok=True)
         return curves, dispersion
 
-    def _result(
-        self,
-        network: PolicyNetwork,
-        dataset: RolloutDataset,
-        training_data: TrainingData,
-        curves: pd.DataFrame,
-    ) -> TrainingResult:
-        """Returns the networks with the situations that they have learned from."""
-        head = head_class(self.settings.head).for_model(training_data.simulator.model)
-        found = _training_result(network, dataset, training_data, curves, head)
-        has_cold_starts = (
-            training_data.pairs.base is not None and self.settings.cold_start_fraction > 0
+
+def start_policy(start: str) -> Agent:
+    """Returns the policy that networks begin as, with one network.
+
+    Args:
+        start: the folder of a finished job, or `cfx://NAME`; its network for unseen drivers, or the
+            one that `#NETWORK` behind it names.
+
+    Raises:
+        DataError: there is no such policy, or none with such a network.
+    """
+    place, _, name = start.partition("#")
+    folder = folder_of_ready_made(place) if is_ready_made(place) else Path(place).expanduser()
+    try:
+        agent = saved.load(folder / "policy")
+        if not name:
+            return agent.for_unseen_drivers()
+        if name not in agent.names:
+            raise DataError(f"it has no network '{name}', but {', '.join(agent.names)}")
+    except DataError as error:
+        raise DataError(f"learner.start={start}: {error}") from None
+    return agent.only(torch.tensor([agent.names.index(name)]))
+
+
+def check_start(
+    start: str, agent: Agent, policy: Policy, training_data: TrainingData, head: ParameterHead
+) -> None:
+    """Checks that networks of this training can begin as an agent's.
+
+    Raises:
+        ConfigError: the policy, the model, the head, windows or the time step are others.
+    """
+    model, windows = training_data.simulator.model, training_data.windows
+    unlike: list[tuple[str, object]] = []
+    if agent.policy.identity() != policy.identity():
+        unlike.append(("policy", agent.policy_node))
+    is_other = not isinstance(model, registry.get("model", str(agent.model_node.get("name"))))
+    if is_other or agent.model_space.names != model.space.names:
+        unlike.append(("model", agent.model_node))
+    if agent.head.name != head.name:
+        unlike.append(("learner.head", agent.head.name))
+    if agent.windows != windows:
+        unlike.append(("windows", agent.windows.model_dump()))
+    if abs(agent.dt - training_data.simulator.dt) > 1e-6:
+        unlike.append(("data.time_step", agent.dt))
+    if unlike:
+        key, value = unlike[0]
+        if isinstance(value, Mapping):
+            value = value.get("name", dict(value))
+        raise ConfigError(
+            f"learner.start={start}: its {key} is {value} with other settings than here; set {key}"
+            " as that job's config.yaml has it (experiment=fine_tune fits cfx://idm-history)"
         )
-        augment = None
-        if has_cold_starts:
-            generator = torch.Generator().manual_seed(training_data.seed)
-            time_gap = time_gaps(training_data)
-            augment = Augmentation(self.settings, time_gap, generator)
-        return replace(found, valid_range=learned_range(training_data, augment))
-
-    def checkpoint(self, policy: Policy, training_data: TrainingData) -> Path | None:
-        """Returns the file from which this very training goes on, or None without a workspace."""
-        return checkpoint_path(self.identity(), policy, training_data)
 
 
-def _training_result(
-    network: PolicyNetwork,
-    dataset: RolloutDataset,
-    training_data: TrainingData,
-    curves: pd.DataFrame,
-    head: ParameterHead,
-) -> TrainingResult:
-    """Returns the networks; those of an ensemble as one."""
-    ensemble_size = dataset.ensemble_size
-    first = slice(None, None, ensemble_size)
-    if ensemble_size > 1:
-        network = Ensemble(network, ensemble_size).eval()
-    return TrainingResult(
-        network=network,
-        scaler=Scaler(dataset.scaler.mean[first].clone(), dataset.scaler.scale[first].clone()),
-        curves=curves,
-        base=head.space.from_unit(dataset.pooled[first].to(training_data.pairs.fixed.dtype)),
-        head=head.name,
-    )
+def begun(
+    agent: Agent, network: PolicyNetwork, dataset: RolloutDataset
+) -> tuple[PolicyNetwork, RolloutDataset]:
+    """Gives networks an agent's weights, and the data its scaler.
+
+    Args:
+        agent: with one network, of M.
+        network: N untrained networks, changed in place.
+        dataset: what they learn from.
+
+    Raises:
+        ConfigError: the agent has another number of networks in its ensemble.
+    """
+    size = agent.core.ensemble_size
+    if size != dataset.ensemble_size:
+        raise ConfigError(
+            f"learner.start: that policy's ensemble has {size} networks; set"
+            f" learner.ensemble_size={size}"
+        )
+    weights: dict[str, Tensor] = {}
+    for name, value in agent.network.state_dict().items():
+        repeated = value.repeat(len(dataset.pair) // size, *[1] * (value.dim() - 1))
+        weights[name.removeprefix("members.") if size > 1 else name] = repeated
+    network.load_state_dict(weights)
+    mean, scale = agent.scaler.mean, agent.scaler.scale
+    networks = len(dataset.pair)
+    scaler = Scaler(mean.expand(networks, -1).clone(), scale.expand(networks, -1).clone())
+    return network, replace(dataset, scaler=scaler.to(dataset.pair.device))

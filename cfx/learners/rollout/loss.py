@@ -20,10 +20,9 @@ from torch import Tensor
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives import FrameValues, GapRmse, Objective, SpeedRmse
 from cfx.learners.base import TrainingData
-from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.inputs import RolloutBatch
-from cfx.learners.rollout.loop import Segment
+from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.settings import LossSettings
+from cfx.learners.rollout.window import Segment
 
 _AT_ONCE = 1_000_000
 """Frames of all segments that are simulated at once, which bounds the memory to some 100 MB."""

@@ -1,4 +1,6 @@
-"""The Lightning module of closed-loop training: gradient steps, their schedules, and validation.
+"""Training of a shard of networks, wherever it is: gradient steps, schedules, and validation.
+
+Importing this imports Lightning, which takes seconds and 100 MB.
 
 Shapes: N networks (each member of an ensemble counts), D trajectories of each.
 """
@@ -7,35 +9,30 @@ from __future__ import annotations
 
 import logging
 import math
+import os
 from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
-import lightning.pytorch as pl
 import pandas as pd
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from cfx.learners.base import TrainingData
-from cfx.learners.batched import BatchedModule
-from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.inputs import Measured, RolloutBatch
+from cfx.core.engine import Report
+from cfx.learners.batched import BatchedModule, fit
+from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.loop import Expert, simulate
-from cfx.learners.rollout.loss import BaseErrors, Divisors, FrameWeights, TrajectoryLoss
+from cfx.learners.rollout.loss import Divisors, FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
 from cfx.learners.rollout.scan import Scan
 from cfx.learners.rollout.settings import RolloutSettings
-from cfx.learners.rollout.window import (
-    GradientPath,
-    NoGradients,
-    ThroughMemory,
-    ThroughTime,
-    WindowStep,
-)
-from cfx.policies.base import Policy, PolicyNetwork
+from cfx.learners.rollout.shard import TrainedShard, TrainingShard, untrained
+from cfx.learners.rollout.window import GradientPath, WindowStep
 from cfx.policies.core import AgentCore
-from cfx.policies.heads import head_class
 from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.rollout import can_compile
 
@@ -71,61 +68,32 @@ _WARM_UP = 20
 """Gradient steps over which the learning rate rises."""
 
 
-class StepNumbers(pl.LightningDataModule):
-    """The numbers of an epoch's gradient steps; what a step samples follows from its number."""
-
-    def __init__(self, steps: int) -> None:
-        super().__init__()
-        self.steps = steps
-
-    def train_dataloader(self) -> DataLoader[Any]:
-        numbers: Any = range(self.steps)
-        return DataLoader(numbers, batch_size=None, shuffle=False)
-
-    def val_dataloader(self) -> DataLoader[Any]:
-        once: Any = [0]
-        return DataLoader(once, batch_size=None)
-
-
 class RolloutModule(BatchedModule):
     """Trains N networks on random trajectories in closed loop.
 
     Args:
-        network: what is trained.
-        dataset: what it learns from.
-        policy: the component that built the network.
-        training_data: simulator, objective and seed.
-        settings: how it is trained.
-        errors: of the bases of these trajectories; None: they are simulated.
+        shard: the networks, and what they learn from.
         expert: networks to imitate in the first `settings.distillation_epochs` epochs.
         on_epoch: called after each epoch.
     """
 
+    settings: RolloutSettings
+
     def __init__(
         self,
-        network: PolicyNetwork,
-        dataset: RolloutDataset,
-        policy: Policy,
-        training_data: TrainingData,
-        settings: RolloutSettings,
-        errors: BaseErrors | None = None,
+        shard: TrainingShard,
         expert: Expert | None = None,
         on_epoch: Callable[[], None] = lambda: None,
     ) -> None:
-        ensemble_size = dataset.ensemble_size
-        super().__init__(
-            network, training_data.names, settings, on_epoch, ensemble_size=ensemble_size
-        )
-        self.automatic_optimization = False
-        self.dataset = dataset
-        self.settings = settings
-        self.expert = expert
-        device = dataset.base.device
-        model, dt = training_data.simulator.model, training_data.simulator.dt
-        windows = training_data.windows
-        head = head_class(settings.head).for_model(model, device)
-        model = head.driven_model(model)
-        core = AgentCore(policy, network, dataset.scaler, head)
+        settings, dataset, training_data = shard.settings, shard.dataset, shard.training_data
+        head, size, device = shard.head, dataset.ensemble_size, dataset.base.device
+        network = untrained(shard.policy, dataset, head, torch.Generator())
+        network.load_state_dict(shard.weights)
+        super().__init__(network, training_data.names, settings, on_epoch, ensemble_size=size)
+        self.shard, self.expert = shard, expert
+        windows, dt = training_data.windows, training_data.simulator.dt
+        model = head.driven_model(training_data.simulator.model)
+        core = AgentCore(shard.policy, network, dataset.scaler, head)
         self.temperature = torch.tensor(settings.temperature, device=device)
         self.exact_step = WindowStep(core, model, windows, dt)
         if settings.temperature > 0:
@@ -134,9 +102,6 @@ class RolloutModule(BatchedModule):
         self.scans: dict[WindowStep, Scan] = {}
         if self._is_worth_compiling():
             self._compile()
-        if errors is None:
-            errors = BaseErrors.of(training_data, dataset, settings.horizon)
-        self.errors = errors
         self.loss = TrajectoryLoss(training_data.objective, settings, dt)
         self.sampler = TrajectorySampler(
             dataset,
@@ -148,12 +113,20 @@ class RolloutModule(BatchedModule):
         if settings.time_weighting == "relative":
             self.loss.frame_weights = self._frame_weights()
         clip = settings.gradient_clip_state / self.sampler.trajectories
-        bounds = (settings.gradient_decay, clip, settings.tbptt_windows)
-        self.through_time = ThroughTime(*bounds)
-        self.through_memory = ThroughMemory(*bounds)
+        self.through_time = GradientPath(settings.gradient_decay, clip, settings.tbptt_windows)
         self.losses: list[Tensor] = []
         self._noise_of = 0  # the gradient step whose noise is drawn
         self.dispersion = torch.ones(len(dataset.pair), device=device)
+
+    @property
+    def dataset(self) -> RolloutDataset:
+        """The drivers of the networks."""
+        return self.shard.dataset
+
+    def train_dataloader(self) -> DataLoader[Any]:
+        """Returns the numbers of an epoch's gradient steps; what is sampled follows from them."""
+        numbers: Any = range(self.settings.steps)
+        return DataLoader(numbers, batch_size=None)
 
     def configure_optimizers(self) -> Any:
         optimizer = super().configure_optimizers()
@@ -189,10 +162,10 @@ class RolloutModule(BatchedModule):
         batch = self.sampler.training(step)
         self._noise_of = step
         count = batch.weight.sum(1).clamp(min=1.0)
-        divisors = self.errors.over_horizon(batch)
+        divisors = self.shard.errors.over_horizon(batch)
         expert, path = None, self.through_time
         if self.expert is not None and self.current_epoch < self.settings.distillation_epochs:
-            expert, path = self.expert, self.through_memory
+            expert, path = self.expert, replace(path, through_motion=False)
         losses = self.trajectory_losses(
             self.training_window, batch, self.settings.horizon, divisors, path, expert
         )
@@ -205,7 +178,7 @@ class RolloutModule(BatchedModule):
         batch: RolloutBatch,
         windows: int,
         divisors: Divisors,
-        path: GradientPath,
+        path: GradientPath | None = None,
         expert: Expert | None = None,
     ) -> Iterator[Tensor]:
         """Simulates trajectories; yields the loss of each, `(N, D)`, of each segment.
@@ -219,14 +192,10 @@ class RolloutModule(BatchedModule):
             batch: the trajectories.
             windows: how many each lasts.
             divisors: of their losses.
-            path: the way that gradients take back; with `NoGradients` all history is observed.
+            path: the way that gradients take back; None: none, and all history is observed.
             expert: networks to imitate; None: none.
         """
-        most = None
-        if not isinstance(path, NoGradients):
-            most = self.burn_in_windows
-        sampled = 0
-        noise = None
+        sampled, noise = 0, None
         if self.samples_paths and expert is None:
             sampled = self.settings.paths
             noise = self._noise(batch, windows, sampled)
@@ -238,10 +207,9 @@ class RolloutModule(BatchedModule):
             batch,
             windows,
             path,
-            burn_in_windows=most,
+            burn_in_windows=None if path is None else self.burn_in_windows,
             expert=expert,
             noise=noise,
-            paths=1 + sampled,
             scan=self.scans.get(step),
         )
         centre = slice(None, batch.place.shape[1])
@@ -332,18 +300,12 @@ class RolloutModule(BatchedModule):
             self._noise_of = first
             paths = min(together, _COVERING - first)
             noise = self._noise(batch, windows, paths)
-            path = NoGradients()
-            found = simulate(step, self.dataset, batch, windows, path, noise=noise, paths=paths)
-            segment = next(found)
+            segment = next(simulate(step, self.dataset, batch, windows, noise=noise))
             speed = segment.speed.view(networks, paths, count, -1)
             lows.append(speed.amin(1))
             highs.append(speed.amax(1))
         low, high = torch.stack(lows).amin(0), torch.stack(highs).amax(0)
-        once = slice(None, count)
-        everything = segment.measured
-        measured = Measured(
-            everything.speed[:, once], everything.gap[:, once], everything.counted[:, once]
-        )
+        measured = segment.only(slice(count)).measured
         within = (low <= measured.speed) & (measured.speed <= high)
         weight = measured.counted * batch.weight[..., None]
         later = slice(step.stride, None)
@@ -354,8 +316,7 @@ class RolloutModule(BatchedModule):
         """Returns weights relative to the errors of each untrained network."""
         batch = self.sampler.training(0)
         windows = self.settings.horizon
-        segments = simulate(self.exact_step, self.dataset, batch, windows, NoGradients())
-        segment = next(segments)
+        segment = next(simulate(self.exact_step, self.dataset, batch, windows))
         weight = segment.measured.counted * batch.weight[..., None]
         count = weight.sum(1, keepdim=True).clamp(min=1.0)
         speed = (segment.speed - segment.measured.speed).square() * weight
@@ -403,7 +364,7 @@ class RolloutModule(BatchedModule):
     def _loss_with_history(self) -> Tensor:
         """Returns the loss over the horizon, `(N,)`."""
         batch = self.sampler.validation_with_history()
-        return self._exact_loss(batch, self.settings.horizon, self.errors.over_horizon(batch))
+        return self._exact_loss(batch, self.settings.horizon, self.shard.errors.over_horizon(batch))
 
     def _loss_of_cold_starts(self) -> Tensor:
         """Returns the loss of full trajectories, `(N,)`; NaN for networks that keep none."""
@@ -411,11 +372,11 @@ class RolloutModule(BatchedModule):
         if not bool(batch.weight.any()):
             return batch.weight.new_full((len(batch.weight),), torch.nan)
         windows = -(-int(batch.last.max()) // self.exact_step.stride)
-        return self._exact_loss(batch, windows, self.errors.over_full_trajectory(batch))
+        return self._exact_loss(batch, windows, self.shard.errors.over_full_trajectory(batch))
 
     def _exact_loss(self, batch: RolloutBatch, windows: int, divisors: Divisors) -> Tensor:
         self._noise_of = 0
-        losses = self.trajectory_losses(self.exact_step, batch, windows, divisors, NoGradients())
+        losses = self.trajectory_losses(self.exact_step, batch, windows, divisors)
         return _weighted_mean(next(losses), batch.weight)
 
     def _rate(self, step: int) -> float:
@@ -452,3 +413,48 @@ class RolloutModule(BatchedModule):
 def _weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
     """Returns the weighted mean over trajectories, `(N,)`; NaN where nothing has weight."""
     return torch.where(weight > 0, values, 0.0).mul(weight).sum(1) / weight.sum(1)
+
+
+def train(shard: TrainingShard, report: Report) -> TrainedShard:
+    """Trains the networks of a shard.
+
+    Training goes on from the shard's checkpoint, and leaves it behind. Where there is no place for
+    it, as on a worker without the job's disk, an interrupted training begins again.
+
+    Args:
+        shard: which networks, and what they learn from.
+        report: called with how many epochs are done, in the end all that were planned.
+    """
+    if shard.checkpoint is not None and not _has_place(shard.checkpoint):
+        expert = shard.expert and replace(shard.expert, checkpoint=None)
+        shard = replace(shard, checkpoint=None, expert=expert)
+    module = _trained(shard, report)
+    return TrainedShard(module.network.state_dict(), module.curves(), module.fit_dispersion())
+
+
+def _trained(shard: TrainingShard, report: Report) -> RolloutModule:
+    """Returns trained networks; their experts are trained before."""
+    expert = None
+    if shard.expert is not None:
+        taught = _trained(shard.expert, report)
+        taught.network.requires_grad_(False)
+        if taught.scans:
+            # Experts say one window at a time what they would do.
+            taught.training_window.compile()
+        expert = Expert(taught.training_window, taught.dataset)
+    module = RolloutModule(shard, expert, lambda: report(1))
+    seed, device = shard.training_data.seed, shard.dataset.pair.device
+    fit(module, shard.settings.epochs, seed, device, shard.checkpoint)
+    report(shard.settings.epochs - len(module.rows))
+    return module
+
+
+def _has_place(checkpoint: Path) -> bool:
+    """Says whether the folder of a checkpoint can be written to; makes it."""
+    folder = checkpoint.parent
+    with suppress(OSError):
+        folder.mkdir(parents=True, exist_ok=True)
+    if os.access(folder, os.W_OK):
+        return True
+    log.warning("%s cannot be written to: if this training is interrupted, it begins again", folder)
+    return False

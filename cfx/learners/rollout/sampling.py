@@ -12,8 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.inputs import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.policies.features import History
 

@@ -23,14 +23,13 @@ from torch import Tensor
 
 from cfx.core.memory import keep_freed_memory
 from cfx.core.threads import cores, share
-from cfx.learners.rollout.dataset import Conditioning
-from cfx.learners.rollout.inputs import RolloutInputs
+from cfx.learners.rollout.dataset import Conditioning, RolloutBatch, RolloutDataset
 from cfx.learners.rollout.window import (
     GradientPath,
     LeaderWindow,
     LoopState,
-    ThroughMemory,
-    ThroughTime,
+    RolloutInputs,
+    Segment,
     WindowStep,
 )
 from cfx.policies.features import token_width
@@ -44,17 +43,8 @@ _REMEMBERED = 10
 driven ones (`gradient_decay`). With all windows the gradients of a recurrent network of 64 units
 differ by a thousandth."""
 
-
-class Observed(NamedTuple):
-    """What networks observe before they drive.
-
-    Attributes:
-        features: normalised, `(B, N, D, F)`.
-        present: 1 where a trajectory has this window, else 0, `(B, N, D)`.
-    """
-
-    features: Tensor
-    present: Tensor
+_MOTION = ("position", "speed", "acceleration")
+"""What is simulated of a vehicle, in the order of `LoopState`."""
 
 
 class Stand(NamedTuple):
@@ -131,17 +121,17 @@ class Scan:
             raise Unsupported("networks that are not recurrent, or have dropout")
         self.step, self.network, self.temperature = step, network, temperature
         length = step.length
-        motion = {"position": length, "speed": length, "acceleration": length}
-        leader = {f"leader_{name}": length + step.stride for name in motion}
+        motion = dict.fromkeys(_MOTION, length)
+        leader = {f"leader_{name}": length + step.stride for name in _MOTION}
         around = {**motion, **leader, "leader_length": 1}
         width = core.scaler.mean.shape[-1]
         known = width - token_width(core.inputs, core.summary, length)
         read = {**around, "conditioning": known, "mean": width, "scale": width}
-        self.features = _Part(self._read, read, list(motion), [key, "features"])
+        self.features = _Part(self._read, read, _MOTION, [key, "features"])
         moved = {**around, "memory": step.model.memory_size, "base": len(core.head.space)}
         moved |= {"logits": core.head.answers, "bias": core.head.answers}
         moved |= {"temperature": 0 if temperature is None else 1}
-        wanted = [*motion, "memory", "logits"] if trains else []
+        wanted = [*_MOTION, "memory", "logits"] if trains else []
         self.drive = _Part(self._moved, moved, wanted, [key, "drive", temperature is None])
         gates = {"projected": network.gates, "recurrent": network.gates, "carried": network.states}
         more = {"input_bias": network.gates, "hidden_bias": network.gates, "present": 1}
@@ -164,63 +154,41 @@ class Scan:
 
     def simulate(
         self,
-        inputs: RolloutInputs,
-        observed: Observed,
-        conditioning: Conditioning,
+        dataset: RolloutDataset,
+        batch: RolloutBatch,
         windows: int,
-        path: GradientPath,
-    ) -> Iterator[tuple[Tensor, Tensor]]:
-        """Simulates trajectories in closed loop.
-
-        Args:
-            inputs: what was measured.
-            observed: before they begin.
-            conditioning: of these trajectories.
-            windows: H.
-            path: the way that gradients take back.
-
-        Yields:
-            Speed (m/s) and gap (m) between two cuts of the gradients, `(N, D, frames)` each.
-        """
-        networks, trajectories = conditioning.pair.shape
+        path: GradientPath | None,
+        burn_in_windows: int | None,
+    ) -> Iterator[Segment]:
+        """Simulates trajectories in closed loop; arguments are those of `loop.simulate`."""
+        step, network = self.step, self.network
+        conditioning = dataset.condition(batch)
+        pairs, shape = dataset.recordings.batch, conditioning.pair.shape
+        inputs = RolloutInputs.of(pairs, conditioning.pair, batch, step, windows)
+        known = _Known.of(dataset, batch, conditioning, inputs, burn_in_windows)
         follower = inputs.follower.permute(0, 3, 1, 2).flatten(0, 1)
         motion = torch.cat([follower, inputs.memory.permute(2, 0, 1)])
-        carried = self.network.initial_state(networks, trajectories)
-        stand = Stand(motion, carried.chunk(len(self.network.layers), -1))
-        if torch.is_grad_enabled() and len(observed.present) > _REMEMBERED:
-            earlier = Observed(observed.features[:-_REMEMBERED], observed.present[:-_REMEMBERED])
-            observed = Observed(observed.features[-_REMEMBERED:], observed.present[-_REMEMBERED:])
+        carried = network.initial_state(*shape).chunk(len(network.layers), -1)
+        stand, seen, nothing = Stand(motion, carried), slice(None), slice(0, 0)
+        if torch.is_grad_enabled() and len(known.present) > _REMEMBERED:
+            earlier, seen = slice(-_REMEMBERED), slice(-_REMEMBERED, None)
             with torch.no_grad():
-                stand = self._observe(inputs, earlier, conditioning, stand, path)
-        length = path.segment_length(windows)
-        weights = tuple(self.network.parameters())
+                loop = _Loop(self, known.windows(earlier, nothing), stand, path)
+                loop.forward()
+            stand = loop.after
+        length = windows if path is None or path.cut_after is None else path.cut_after
+        weights = tuple(network.parameters())
         for first in range(0, windows, length):
             driven = slice(first, min(first + length, windows))
-            loop = _Loop(self, _Known.of(inputs, observed, conditioning, driven), stand, path)
+            loop = _Loop(self, known.windows(seen, driven), stand, path)
             speed, gap = _Trajectory.apply(loop, *weights)  # type: ignore[no-untyped-call]
-            yield speed, gap
-            stand = loop.after
-            observed = Observed(observed.features[:0], observed.present[:0])
-
-    def _observe(
-        self,
-        inputs: RolloutInputs,
-        observed: Observed,
-        conditioning: Conditioning,
-        stand: Stand,
-        path: GradientPath,
-    ) -> Stand:
-        """Lets networks observe windows; returns where trajectories stand behind them."""
-        known = _Known.of(inputs, observed, conditioning, slice(0, 0))
-        loop = _Loop(self, known, stand, path)
-        loop.forward()
-        return loop.after
+            frames = slice(first * step.stride, driven.stop * step.stride)
+            yield Segment(speed, gap, inputs.measured_at(frames), None, frames.start)
+            stand, seen = loop.after, nothing
 
     def _read(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
         """Returns normalised features."""
-        now, leader = _stand(given), _leader(given)
-        length = given["leader_length"][..., 0]
-        features = self.step.features(now, leader, length, given["conditioning"])
+        features = self.step.features(*_around(given), given["conditioning"])
         return [(features - given["mean"]) / given["scale"]]
 
     def _moved(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
@@ -230,8 +198,7 @@ class Scan:
             step = copy.copy(step)
             step.model = step.model.at_temperature(given["temperature"][..., 0])
         answer = (given["logits"] + given["bias"]).sigmoid()
-        length = given["leader_length"][..., 0]
-        after, speed, gap = step.steer(answer, _stand(given), _leader(given), length, given["base"])
+        after, speed, gap = step.steer(answer, *_around(given), given["base"])
         moved = [after.position, after.speed, after.acceleration]
         if after.memory.shape[-1] > 0:
             moved.append(after.memory)
@@ -245,32 +212,29 @@ class Scan:
         return [torch.where(given["present"] > 0, after, given["carried"])]
 
 
-def _stand(given: Mapping[str, Tensor]) -> LoopState:
+def _around(given: Mapping[str, Tensor]) -> tuple[LoopState, LeaderWindow, Tensor]:
+    """Returns where trajectories stand, and the leaders around a window with their lengths."""
     nothing = given["position"][..., :0]
-    memory = given.get("memory", nothing)
-    return LoopState(
-        given["position"], given["speed"], given["acceleration"], memory, nothing, nothing
-    )
-
-
-def _leader(given: Mapping[str, Tensor]) -> LeaderWindow:
-    return LeaderWindow(
-        given["leader_position"], given["leader_speed"], given["leader_acceleration"]
-    )
+    motion = (given["position"], given["speed"], given["acceleration"])
+    now = LoopState(*motion, given.get("memory", nothing), nothing, nothing)
+    leader = LeaderWindow(*(given[f"leader_{name}"] for name in _MOTION))
+    return now, leader, given["leader_length"][..., 0]
 
 
 class _Known(NamedTuple):
-    """What a part of the loop reads that no network changes.
+    """What some windows read that no network changes.
 
     Attributes:
-        observed: before it.
+        features: of observed windows, normalised, `(B, N, D, F)`.
+        present: 1 where a trajectory has that window, else 0, `(B, N, D)`.
         leader: `(3, H, N, D, L + S)`.
         leader_length: `(N, D)`.
         conditioning: `(N, D, c)`.
         base: `(N, D, n)`.
     """
 
-    observed: Observed
+    features: Tensor
+    present: Tensor
     leader: Tensor
     leader_length: Tensor
     conditioning: Tensor
@@ -278,11 +242,40 @@ class _Known(NamedTuple):
 
     @classmethod
     def of(
-        cls, inputs: RolloutInputs, observed: Observed, conditioning: Conditioning, driven: slice
+        cls,
+        dataset: RolloutDataset,
+        batch: RolloutBatch,
+        conditioning: Conditioning,
+        inputs: RolloutInputs,
+        most: int | None,
     ) -> _Known:
-        """Returns what some windows read."""
-        leader, length = inputs.leader[:, driven], inputs.leader_length
-        return cls(observed, leader, length, conditioning.features, conditioning.base)
+        """Returns what trajectories read; `most` windows are observed before them at most."""
+        tokens, present = dataset.observed_windows(batch, conditioning.pair, most)
+        known, scaler = conditioning.features, dataset.scaler
+        features = torch.cat([tokens, known.expand(len(tokens), -1, -1, -1)], -1)
+        features.sub_(scaler.mean[:, None]).div_(scaler.scale[:, None])
+        leader = (inputs.leader, inputs.leader_length)
+        return cls(features, present.to(tokens.dtype), *leader, known, conditioning.base)
+
+    def windows(self, observed: slice, driven: slice) -> _Known:
+        """Returns what some of the windows read."""
+        features, present = self.features[observed], self.present[observed]
+        return self._replace(features=features, present=present, leader=self.leader[:, driven])
+
+
+class _Layer(NamedTuple):
+    """A recurrent layer and its values in windows.
+
+    Attributes:
+        weights: of the layer.
+        carried: `(N, slots, D, c)`, the first of them before the first window.
+        projected, recurrent: parts of the gates, `(N, slots, D, G)`.
+    """
+
+    weights: RecurrentLayer
+    carried: Tensor
+    projected: Tensor
+    recurrent: Tensor
 
 
 class _Loop:
@@ -291,12 +284,11 @@ class _Loop:
     Where gradients are recorded every window is kept, else as few as there must be.
     """
 
-    def __init__(self, scan: Scan, known: _Known, stand: Stand, path: GradientPath) -> None:
+    def __init__(self, scan: Scan, known: _Known, stand: Stand, path: GradientPath | None) -> None:
         self.scan, self.known, self.path = scan, known, path
         network, step = scan.network, scan.step
-        self.observed, self.driven = len(known.observed.present), known.leader.shape[1]
-        self.windows = self.observed + self.driven
-        self.shape = networks, trajectories = known.leader_length.shape
+        self.observed, self.driven = len(known.present), known.leader.shape[1]
+        networks, trajectories = self.shape
         new = stand.motion.new_empty
         windows, driven = self.windows, self.driven
         slots, moved = windows + 1, driven + 1
@@ -304,21 +296,34 @@ class _Loop:
             windows, driven, slots, moved = 1, 1, 2, 2
         self.motion = new((moved, len(stand.motion), networks, trajectories))
         self.motion[0] = stand.motion
-        self.read = new((networks, driven, trajectories, scan.step.core.scaler.mean.shape[-1]))
-        gates = network.gates * network.hidden
-        self.carried, self.projected, self.recurrent = [], [], []
-        for before in stand.carried:
-            kept = new((networks, slots, trajectories, before.shape[-1]))
-            kept[:, 0] = before
-            self.carried.append(kept)
-            self.projected.append(new((networks, windows, trajectories, gates)))
-            self.recurrent.append(new((networks, windows, trajectories, gates)))
+        self.read = new((networks, driven, trajectories, step.core.scaler.mean.shape[-1]))
+        gates = (networks, windows, trajectories, network.gates * network.hidden)
+        self.layers = []
+        for weights, before in zip(network.layers, stand.carried, strict=True):
+            assert isinstance(weights, RecurrentLayer)
+            carried = new((networks, slots, trajectories, before.shape[-1]))
+            carried[:, 0] = before
+            self.layers.append(_Layer(weights, carried, new(gates), new(gates)))
         self.logits = new((networks, driven, trajectories, step.core.head.answers))
         self.speed = new((networks, trajectories, self.driven * step.stride))
         self.gap = torch.empty_like(self.speed)
-        self.layers = [layer for layer in network.layers if isinstance(layer, RecurrentLayer)]
-        self.outputs = slice(network.hidden)
         self.around = self._around() if self.driven > 0 else {}
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """The networks, and the trajectories of each: N and D."""
+        networks, trajectories = self.known.leader_length.shape
+        return networks, trajectories
+
+    @property
+    def windows(self) -> int:
+        """The number of windows."""
+        return self.observed + self.driven
+
+    @property
+    def outputs(self) -> slice:
+        """Which of the numbers that a layer carries are its output."""
+        return slice(self.scan.network.hidden)
 
     def _around(self) -> dict[str, Operand]:
         """Returns all that the features and the steps of a window depend on."""
@@ -335,9 +340,8 @@ class _Loop:
         if scan.temperature is not None:
             shared["temperature"] = scan.temperature.expand(everywhere[:-1]).unsqueeze(-1)
         around = {name: Operand(value) for name, value in shared.items()}
-        names = ("leader_position", "leader_speed", "leader_acceleration")
-        for name, signal in zip(names, known.leader, strict=True):
-            around[name] = Operand.over(signal.unsqueeze(2), -self.observed)
+        for name, signal in zip(_MOTION, known.leader, strict=True):
+            around[f"leader_{name}"] = Operand.over(signal.unsqueeze(2), -self.observed)
         around["logits"] = self.in_driven(self.logits)
         return around | self.columns(self.motion, -self.observed)
 
@@ -345,10 +349,9 @@ class _Loop:
         """Returns motion `(slots, M, N, D)` by name."""
         length = self.scan.step.length
         whole = Operand.over(motion.permute(0, 2, 3, 1).unsqueeze(2), offset)
-        names = ("position", "speed", "acceleration")
-        found = {
-            name: whole.only(slice(k * length, (k + 1) * length)) for k, name in enumerate(names)
-        }
+        found = {}
+        for k, name in enumerate(_MOTION):
+            found[name] = whole.only(slice(k * length, (k + 1) * length))
         if motion.shape[1] > 3 * length:
             found["memory"] = whole.only(slice(3 * length, None))
         return found
@@ -364,7 +367,7 @@ class _Loop:
 
     def output(self, number: int) -> Operand:
         """Returns the output of a layer in a window."""
-        return _rows(self.carried[number], 1).only(self.outputs)
+        return _rows(self.layers[number].carried, 1).only(self.outputs)
 
     def seen(self, number: int, *, acts: bool) -> Operand:
         """Returns what a layer reads in a window."""
@@ -372,25 +375,26 @@ class _Loop:
             return self.output(number - 1)
         if acts:
             return self.in_driven(self.read)
-        return Operand.over(self.known.observed.features.unsqueeze(2))
+        return Operand.over(self.known.features.unsqueeze(2))
 
     def gates(self, number: int, *, acts: bool) -> dict[str, Operand]:
         """Returns all that a layer's cell depends on in a window."""
         layer, network = self.layers[number], self.scan.network
-        bias = layer.b_input.detach()
+        weights = layer.weights
+        bias, hidden = weights.b_input.detach(), weights.b_hidden.detach()
         if number == 0 and acts and network.b_acting is not None:
             bias = bias + network.b_acting.detach()[:, 0]
         units = (*self.shape, network.hidden, 1)
         present = Operand(self.motion.new_ones(()).expand(units))
         if not acts:
-            observed = self.known.observed.present[..., None, None]
+            observed = self.known.present[..., None, None]
             present = Operand.over(observed.expand(-1, *units))
         return {
-            "projected": self.units(self.projected[number]),
-            "recurrent": self.units(self.recurrent[number]),
-            "carried": self.units(self.carried[number]),
+            "projected": self.units(layer.projected),
+            "recurrent": self.units(layer.recurrent),
+            "carried": self.units(layer.carried),
             "input_bias": Operand(self._by_unit(bias.expand(*self.shape, -1))),
-            "hidden_bias": Operand(self._by_unit(layer.b_hidden.detach().expand(*self.shape, -1))),
+            "hidden_bias": Operand(self._by_unit(hidden.expand(*self.shape, -1))),
             "present": present,
         }
 
@@ -405,7 +409,8 @@ class _Loop:
     @property
     def after(self) -> Stand:
         """Where trajectories stand behind the last window."""
-        carried = tuple(kept[:, self.windows % kept.shape[1]] for kept in self.carried)
+        last = self.windows % self.layers[0].carried.shape[1]
+        carried = tuple(layer.carried[:, last] for layer in self.layers)
         return Stand(self.motion[self.driven % len(self.motion)], carried)
 
     def forward(self) -> None:
@@ -425,10 +430,10 @@ class _Loop:
         if acts:
             scan.features.forward(calls, self.around, [self.in_driven(self.read)])
         for number, layer in enumerate(self.layers):
-            seen, before = self.seen(number, acts=acts), _rows(self.carried[number])
-            calls.product(seen, layer.w_input, _rows(self.projected[number]))
-            calls.product(before.only(self.outputs), layer.w_hidden, _rows(self.recurrent[number]))
-            after = self.units(self.carried[number], 1)
+            seen, before = self.seen(number, acts=acts), _rows(layer.carried)
+            calls.product(seen, layer.weights.w_input, _rows(layer.projected))
+            calls.product(before.only(self.outputs), layer.weights.w_hidden, _rows(layer.recurrent))
+            after = self.units(layer.carried, 1)
             scan.cell.forward(calls, self.gates(number, acts=acts), [after])
         if acts:
             calls.product(self.output(-1), network.w_out, self.in_driven(self.logits))
@@ -467,10 +472,7 @@ class _Gradients:
             self.of[weight] = torch.zeros_like(weight)
         # Of a window and of the one behind it.
         self.motion = speed.new_zeros((2, *loop.motion.shape[1:]))
-        self.carried = []
-        for kept in loop.carried:
-            networks, _, trajectories, width = kept.shape
-            self.carried.append(speed.new_zeros((networks, 2, trajectories, width)))
+        self.carried = [torch.zeros_like(layer.carried[:, :2]) for layer in loop.layers]
 
     def backward(self) -> None:
         """Goes back through all windows."""
@@ -500,25 +502,25 @@ class _Gradients:
             behind = _rows(self.carried[last], 1).only(loop.outputs)
             calls.product(logits, network.w_out.mT, behind, adds=True)
         for number in range(last, -1, -1):
-            layer, carried = loop.layers[number], self.carried[number]
-            projected, recurrent = loop.projected[number], loop.recurrent[number]
+            weights, _, projected, recurrent = loop.layers[number]
+            carried = self.carried[number]
             to_cell = [loop.units(projected), loop.units(recurrent), loop.units(carried)]
             behind = loop.units(carried, 1)
             scan.cell.backward(calls, loop.gates(number, acts=acts), [behind], to_cell)
             before = _rows(carried).only(loop.outputs)
-            calls.product(_rows(recurrent), layer.w_hidden.mT, before, adds=True)
+            calls.product(_rows(recurrent), weights.w_hidden.mT, before, adds=True)
             if number > 0:
                 below = _rows(self.carried[number - 1], 1).only(loop.outputs)
-                calls.product(_rows(projected), layer.w_input.mT, below, adds=True)
+                calls.product(_rows(projected), weights.w_input.mT, below, adds=True)
             elif acts:
-                self._through_features(calls, layer)
+                self._through_features(calls)
         return calls
 
-    def _through_features(self, calls: Calls, layer: RecurrentLayer) -> None:
+    def _through_features(self, calls: Calls) -> None:
         """Adds what goes back from the first layer to the motion before a window."""
-        loop = self.loop
-        read = Operand(loop.read.new_empty(loop.read[:, :1].shape))
-        calls.product(_rows(loop.projected[0]), layer.w_input.mT, read)
+        loop, first = self.loop, self.loop.layers[0]
+        read = Operand(torch.empty_like(loop.read[:, :1]))
+        calls.product(_rows(first.projected), first.weights.w_input.mT, read)
         seen = loop.columns(torch.empty_like(self.motion[:1]), 0)
         seen.pop("memory", None)
         loop.scan.features.backward(calls, loop.around, [read], [*seen.values()])
@@ -529,8 +531,8 @@ class _Gradients:
     def _bound(self, calls: Calls) -> None:
         """Adds what bounds the gradients that come back through a window."""
         path, last = self.loop.path, self.loop.windows - 1
-        assert isinstance(path, ThroughTime)
-        decay = 0.0 if isinstance(path, ThroughMemory) else path.decay
+        assert path is not None
+        decay = path.decay if path.through_motion else 0.0
         for gradient in self.loop.columns(self.motion, 1).values():
             calls.bound(gradient, decay, path.clip, but=last)
         for carried in self.carried:
@@ -541,25 +543,26 @@ class _Gradients:
         loop, network = self.loop, self.loop.scan.network
         drives = first >= loop.observed
         for number, layer in enumerate(loop.layers):
-            projected = loop.projected[number][networks, first:last].flatten(1, 2)
-            recurrent = loop.recurrent[number][networks, first:last].flatten(1, 2)
+            weights = layer.weights
+            projected = layer.projected[networks, first:last].flatten(1, 2)
+            recurrent = layer.recurrent[networks, first:last].flatten(1, 2)
             if number > 0:
-                below = loop.carried[number - 1][networks, first + 1 : last + 1]
+                below = loop.layers[number - 1].carried[networks, first + 1 : last + 1]
                 read = below[..., : network.hidden]
             elif drives:
                 read = loop.read[networks]
             else:
-                read = loop.known.observed.features[:, networks].transpose(0, 1)
-            before = loop.carried[number][networks, first:last, :, : network.hidden]
-            self._of(layer.w_input, networks).baddbmm_(read.flatten(1, 2).mT, projected)
-            self._of(layer.w_hidden, networks).baddbmm_(before.flatten(1, 2).mT, recurrent)
+                read = loop.known.features[:, networks].transpose(0, 1)
+            before = layer.carried[networks, first:last, :, : network.hidden]
+            self._of(weights.w_input, networks).baddbmm_(read.flatten(1, 2).mT, projected)
+            self._of(weights.w_hidden, networks).baddbmm_(before.flatten(1, 2).mT, recurrent)
             bias = projected.sum(1, keepdim=True)
-            self._of(layer.b_input, networks).add_(bias)
-            self._of(layer.b_hidden, networks).add_(recurrent.sum(1, keepdim=True))
+            self._of(weights.b_input, networks).add_(bias)
+            self._of(weights.b_hidden, networks).add_(recurrent.sum(1, keepdim=True))
             if number == 0 and drives and network.b_acting is not None:
                 self._of(network.b_acting, networks).add_(bias[:, None])
         if drives:
-            outputs = loop.carried[-1][networks, first + 1 : last + 1, :, : network.hidden]
+            outputs = loop.layers[-1].carried[networks, first + 1 : last + 1, :, : network.hidden]
             logits = loop.logits[networks].flatten(1, 2)
             self._of(network.w_out, networks).baddbmm_(outputs.flatten(1, 2).mT, logits)
             self._of(network.b_out, networks).add_(logits.sum(1, keepdim=True))

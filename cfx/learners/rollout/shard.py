@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -29,6 +29,7 @@ from cfx.learners.rollout.loss import BaseErrors
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.offset import OffsetHead
 from cfx.simulation.rollout import MemoryStepper
@@ -37,7 +38,7 @@ from cfx.simulation.rollout import MemoryStepper
 def checkpoint_path(
     learner: dict[str, Any], policy: Policy, training_data: TrainingData
 ) -> Path | None:
-    """Returns the file of this very training, or None without a workspace.
+    """Returns the file from which this very training goes on, or None without a workspace.
 
     Args:
         learner: identity of the learner.
@@ -46,6 +47,22 @@ def checkpoint_path(
     """
     if training_data.workspace is None:
         return None
+    recorded, pairs = training_data.recorded, training_data.pairs
+    tensors = [
+        recorded.leader_position,
+        recorded.leader_speed,
+        recorded.follower_position,
+        recorded.follower_speed,
+        pairs.index,
+        pairs.split.frame,
+        pairs.fixed,
+        pairs.network,
+    ]
+    if pairs.base is not None:
+        tensors.append(pairs.base)
+    digest = hashlib.sha256()
+    for tensor in tensors:
+        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
     description = {
         "learner": learner,
         "policy": policy.identity(),
@@ -53,33 +70,12 @@ def checkpoint_path(
         "objective": training_data.objective.identity(),
         "windows": training_data.windows.model_dump(),
         "code": folder_hash(base.__file__),
-        "trajectories": _digest(training_data),
+        "trajectories": digest.hexdigest(),
         "names": training_data.names,
-        "drivers": training_data.pairs.drivers,
+        "drivers": pairs.drivers,
         "seed": training_data.seed,
     }
     return training_data.workspace / f"{content_key(description)}.ckpt"
-
-
-def _digest(training_data: TrainingData) -> str:
-    """Returns the SHA-256 of all tensors that training reads."""
-    batch = training_data.recorded
-    tensors = [
-        batch.leader_position,
-        batch.leader_speed,
-        batch.follower_position,
-        batch.follower_speed,
-        training_data.pairs.index,
-        training_data.pairs.split.frame,
-        training_data.pairs.fixed,
-        training_data.pairs.network,
-    ]
-    if training_data.pairs.base is not None:
-        tensors.append(training_data.pairs.base)
-    digest = hashlib.sha256()
-    for tensor in tensors:
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
-    return digest.hexdigest()
 
 
 _TRAJECTORIES = 3_000
@@ -102,8 +98,9 @@ class TrainingShard:
         dataset: their pairs, placed; it knows which of all networks these are.
         errors: of their bases.
         weights: of the untrained networks.
-        expert_weights: of their untrained experts; None: without distillation.
         checkpoint: the file from which interrupted training goes on; None: no such file.
+        expert: experts that drive by `Direct`, and learn from the same trajectories before; None:
+            without distillation.
     """
 
     settings: RolloutSettings
@@ -112,8 +109,14 @@ class TrainingShard:
     dataset: RolloutDataset
     errors: BaseErrors
     weights: dict[str, Tensor]
-    expert_weights: dict[str, Tensor] | None
-    checkpoint: Path | None
+    checkpoint: Path | None = None
+    expert: TrainingShard | None = None
+
+    @property
+    def head(self) -> ParameterHead:
+        """Makes parameters of the networks' answers."""
+        model, device = self.training_data.simulator.model, self.dataset.pair.device
+        return head_class(self.settings.head).for_model(model, device)
 
 
 @dataclass(frozen=True)
@@ -128,7 +131,7 @@ class TrainedShard:
 
     weights: dict[str, Tensor]
     curves: pd.DataFrame
-    dispersion: Tensor | None = None
+    dispersion: Tensor | None
 
 
 def networks_of_shards(settings: RolloutSettings, dataset: RolloutDataset) -> list[slice]:
@@ -180,7 +183,7 @@ def cut(
     dataset: RolloutDataset,
     network: PolicyNetwork,
     shards: Sequence[slice],
-    checkpoint: Path | None,
+    files: Sequence[Path | None],
 ) -> Iterator[TrainingShard]:
     """Yields the shards of a training; a training that is not cut is one shard.
 
@@ -193,41 +196,39 @@ def cut(
         dataset: of all networks.
         network: all networks, untrained.
         shards: which networks train together (`networks_of_shards`).
-        checkpoint: of the whole training.
+        files: from which interrupted training goes on (`shard_checkpoints`).
     """
     errors = BaseErrors.of(training_data, dataset, settings.horizon)
-    experts = None
+    weights, training_data = network.state_dict(), _without_pairs(training_data)
+    whole = TrainingShard(settings, policy, training_data, dataset, errors, weights)
+    expert_weights = {}
     if settings.distillation_epochs:
-        expert_data, expert_dataset = for_experts(training_data, dataset)
         generator = torch.Generator().manual_seed(training_data.seed)
-        head = OffsetHead.for_model(expert_data.simulator.model)
-        experts = untrained(policy, expert_dataset, head, generator)
-    files = shard_checkpoints(checkpoint, shards)
+        expert = _expert(whole, {})
+        expert_weights = untrained(policy, expert.dataset, expert.head, generator).state_dict()
     for networks, file in zip(shards, files, strict=True):
-        is_whole = len(shards) == 1
-        yield TrainingShard(
-            settings=settings,
-            policy=policy,
-            training_data=_of_networks(training_data, dataset.ensemble_size, networks),
-            dataset=dataset if is_whole else dataset.only(networks),
-            errors=errors if is_whole else errors.only(networks),
-            weights=_weights(network, networks),
-            expert_weights=None if experts is None else _weights(experts, networks),
-            checkpoint=file,
-        )
+        shard = replace(whole, weights=_weights(weights, networks), checkpoint=file)
+        if len(shards) > 1:
+            size = dataset.ensemble_size
+            names = training_data.names[networks.start // size : networks.stop // size]
+            shard = replace(
+                shard,
+                training_data=replace(training_data, names=names),
+                dataset=dataset.only(networks),
+                errors=errors.only(networks),
+            )
+        if expert_weights:
+            shard = replace(shard, expert=_expert(shard, _weights(expert_weights, networks)))
+        yield shard
 
 
-def _weights(network: PolicyNetwork, networks: slice) -> dict[str, Tensor]:
+def _weights(weights: Mapping[str, Tensor], networks: slice) -> dict[str, Tensor]:
     """Returns the weights of some of all networks."""
-    weights = {}
-    for name, value in network.state_dict().items():
-        weights[name] = value[networks].clone()
-    return weights
+    return {name: value[networks].clone() for name, value in weights.items()}
 
 
-def _of_networks(training_data: TrainingData, ensemble_size: int, networks: slice) -> TrainingData:
-    """Returns what is said of some networks; their pairs are left to the dataset."""
-    names = slice(networks.start // ensemble_size, networks.stop // ensemble_size)
+def _without_pairs(training_data: TrainingData) -> TrainingData:
+    """Returns what is said of networks; their pairs are left to the dataset."""
     pairs = training_data.pairs
     return replace(
         training_data,
@@ -239,24 +240,37 @@ def _of_networks(training_data: TrainingData, ensemble_size: int, networks: slic
             fixed=pairs.fixed[:0],
             base=None if pairs.base is None else pairs.base[:0],
         ),
-        names=training_data.names[names],
         workspace=None,
         engine=LocalEngine(),
+    )
+
+
+def _expert(shard: TrainingShard, weights: dict[str, Tensor]) -> TrainingShard:
+    """Returns the experts of a shard: the same trajectories, driven by `Direct`."""
+    s, simulator = shard.settings, MemoryStepper(Direct(), shard.training_data.simulator.dt)
+    epochs = s.epochs - s.distillation_epochs
+    changes = {"head": OffsetHead.name, "distillation_epochs": 0, "epochs": epochs}
+    space, fixed = simulator.model.adaptation_space, shard.training_data.pairs.fixed
+    default = space.to_unit(space.defaults(dtype=fixed.dtype, device=fixed.device)).float()
+    return replace(
+        shard,
+        settings=s.model_copy(update=changes),
+        training_data=replace(shard.training_data, simulator=simulator),
+        dataset=shard.dataset.for_base(default),
+        weights=weights,
+        checkpoint=None if shard.checkpoint is None else expert_checkpoint(shard.checkpoint),
     )
 
 
 def epochs(settings: RolloutSettings) -> int:
     """Returns how many epochs a shard trains at most, those of experts among them."""
     if settings.distillation_epochs:
-        return settings.epochs + expert_settings(settings).epochs
+        return 2 * settings.epochs - settings.distillation_epochs
     return settings.epochs
 
 
 def untrained(
-    policy: Policy,
-    dataset: RolloutDataset,
-    head: ParameterHead,
-    generator: torch.Generator | None = None,
+    policy: Policy, dataset: RolloutDataset, head: ParameterHead, generator: torch.Generator
 ) -> PolicyNetwork:
     """Returns networks that answer no offset, on the device of the dataset.
 
@@ -264,41 +278,9 @@ def untrained(
         policy: builds them.
         dataset: what they will read.
         head: makes parameters of their answers.
-        generator: of their weights; None: weights that are replaced, always the same.
+        generator: of their weights.
     """
-    if generator is None:
-        generator = torch.Generator().manual_seed(0)
     default = head.space.to_unit(head.space.defaults()).float()
     start = head.untrained_answer(default.expand(len(dataset.pair), -1))
     features = dataset.scaler.mean.shape[-1]
     return policy.build(features, default, start, generator).to(dataset.pair.device)
-
-
-def expert_settings(settings: RolloutSettings) -> RolloutSettings:
-    """Returns how the experts of networks are trained."""
-    changes = {
-        "head": OffsetHead.name,
-        "distillation_epochs": 0,
-        "epochs": settings.epochs - settings.distillation_epochs,
-    }
-    return settings.model_copy(update=changes)
-
-
-def for_experts(
-    training_data: TrainingData, dataset: RolloutDataset
-) -> tuple[TrainingData, RolloutDataset]:
-    """Returns what experts learn from: the same trajectories, to be driven by `Direct`."""
-    simulator = MemoryStepper(Direct(), training_data.simulator.dt)
-    space, fixed = simulator.model.adaptation_space, training_data.pairs.fixed
-    default = space.defaults(dtype=fixed.dtype, device=fixed.device)
-    expert_fixed = default.expand(len(fixed), -1)
-    expert_data = replace(
-        training_data,
-        simulator=simulator,
-        pairs=replace(
-            training_data.pairs,
-            fixed=expert_fixed,
-            base=None if training_data.pairs.base is None else expert_fixed,
-        ),
-    )
-    return expert_data, dataset.for_base(space.to_unit(default).float())

@@ -6,18 +6,15 @@ and integration are those of evaluation (`cfx.evaluation.closed_loop`); a test h
 equal.
 
 A closed loop of many windows multiplies Jacobians, and behind a regime switch these can be large:
-the gradients of Wiedemann 99 overflow without a bound. So each way back is an object that says
-where gradients are scaled, clipped or cut (`GradientPath`); the loop itself
-(`cfx.learners.rollout.loop`) does not know.
+the gradients of Wiedemann 99 overflow without a bound. `GradientPath` scales, clips and cuts them.
 
-Shapes: N networks, D trajectories of each, L frames of a token, S steps of a window, f features of
-a token, n tuned parameters, c features of conditioning, s width of the policy's state, m of the
-model's memory, q numbers that a stochastic head keeps.
+Shapes: P pairs, N networks, D trajectories of each, H windows of a trajectory, L frames of a token,
+S steps of a window, f features of a token, n tuned parameters, c features of conditioning, s width
+of the policy's state, m of the model's memory, q numbers that a stochastic head keeps.
 """
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -27,6 +24,8 @@ from torch import Tensor
 from cfx.calibration import losses
 from cfx.core import parameters
 from cfx.core.component import folder_hash
+from cfx.data.pairs import PairBatch
+from cfx.learners.rollout.dataset import RolloutBatch
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies import features
 from cfx.policies.core import AgentCore
@@ -234,41 +233,8 @@ class WindowStep:
         return torch.cat([before, after], -1)[..., self.stride :].contiguous()
 
 
-class GradientPath(ABC):
-    """Base of the ways back.
-
-    Life cycle: the loop asks for `segment_length` once, calls `after_window` on the state behind
-    each window, and `after_segment` behind each segment. Both return the same values.
-    """
-
-    @abstractmethod
-    def segment_length(self, windows: int) -> int:
-        """Returns the number of windows between two losses, for trajectories of `windows`."""
-
-    @abstractmethod
-    def after_window(self, state: LoopState) -> LoopState:
-        """Returns the state from which the next window starts."""
-
-    @abstractmethod
-    def after_segment(self, state: LoopState) -> LoopState:
-        """Returns the state from which the next segment starts."""
-
-
-class NoGradients(GradientPath):
-    """Nothing is recorded: one segment, as in validation."""
-
-    def segment_length(self, windows: int) -> int:
-        return windows
-
-    def after_window(self, state: LoopState) -> LoopState:
-        return state
-
-    def after_segment(self, state: LoopState) -> LoopState:
-        return state
-
-
 @dataclass(frozen=True)
-class ThroughTime(GradientPath):
+class GradientPath:
     """Back-propagation through time, with decay, clipping and cuts.
 
     A decay of g per window makes gradients forget with a time constant of -1 / ln g windows.
@@ -276,54 +242,26 @@ class ThroughTime(GradientPath):
     Attributes:
         decay: factor on gradients that come back through one window, 0 to 1.
         clip: largest absolute value of each of them.
-        cut_after: windows after which they are cut; None: never.
+        cut_after: windows of a segment, between two losses, after which they are cut; None: never.
+        through_motion: whether they come back through the vehicle's motion too; False: through the
+            policy's memory alone.
     """
 
     decay: float
     clip: float
     cut_after: int | None = None
-
-    def segment_length(self, windows: int) -> int:
-        return self.cut_after or windows
+    through_motion: bool = True
 
     def after_window(self, state: LoopState) -> LoopState:
-        return LoopState(
-            self._bounded(state.position),
-            self._bounded(state.speed),
-            self._bounded(state.acceleration),
-            self._bounded(state.memory),
-            self._bounded(state.state),
-            self._bounded(state.latent),
-        )
+        """Returns the state, of the same values, from which the next window starts."""
+        bounded = LoopState(*(_Bounded.apply(value, self.decay, self.clip) for value in state))  # type: ignore[no-untyped-call]
+        if self.through_motion:
+            return bounded
+        return self.after_segment(bounded)._replace(state=bounded.state)
 
     def after_segment(self, state: LoopState) -> LoopState:
-        return LoopState(
-            _cut(state.position),
-            _cut(state.speed),
-            _cut(state.acceleration),
-            _cut(state.memory),
-            _cut(state.state),
-            _cut(state.latent),
-        )
-
-    def _bounded(self, value: Tensor) -> Tensor:
-        bounded: Tensor = _Bounded.apply(value, self.decay, self.clip)  # type: ignore[no-untyped-call]
-        return bounded
-
-
-class ThroughMemory(ThroughTime):
-    """Back-propagates through the policy's memory alone, not through the vehicle's motion."""
-
-    def after_window(self, state: LoopState) -> LoopState:
-        bounded = super().after_window(state)
-        return LoopState(
-            _cut(bounded.position),
-            _cut(bounded.speed),
-            _cut(bounded.acceleration),
-            _cut(bounded.memory),
-            bounded.state,
-            _cut(bounded.latent),
-        )
+        """Returns the state, of the same values, from which the next segment starts."""
+        return LoopState(*(value.detach().requires_grad_() for value in state))
 
 
 class _Bounded(torch.autograd.Function):
@@ -340,6 +278,163 @@ class _Bounded(torch.autograd.Function):
         return gradient.clamp(-ctx.clip, ctx.clip), None, None
 
 
-def _cut(value: Tensor) -> Tensor:
-    """Returns the value without its past, as the start of new gradients."""
-    return value.detach().requires_grad_()
+class Measured(NamedTuple):
+    """Recorded values at simulated frames, `(N, D, frames)` each.
+
+    Attributes:
+        speed: m/s.
+        gap: m.
+        counted: 1 for a frame within the training part, else 0.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    counted: Tensor
+
+
+class Segment(NamedTuple):
+    """Simulated values between two cuts of the gradients, `(N, D, frames)` each.
+
+    Attributes:
+        speed: m/s.
+        gap: m.
+        measured: at the same frames.
+        expert_speed: the speeds at which experts would have driven each window, m/s; None without
+            experts.
+        first: how many frames were simulated before.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    measured: Measured
+    expert_speed: Tensor | None
+    first: int = 0
+
+    def only(self, trajectories: slice) -> Segment:
+        """Returns the segment of some trajectories."""
+        expert_speed = self.expert_speed
+        return Segment(
+            self.speed[:, trajectories],
+            self.gap[:, trajectories],
+            Measured(*(values[:, trajectories] for values in self.measured)),
+            None if expert_speed is None else expert_speed[:, trajectories],
+            self.first,
+        )
+
+
+@dataclass(frozen=True)
+class RolloutInputs:
+    """Recorded values before, during and after trajectories.
+
+    Positions are relative to the follower's at the start of its trajectory.
+
+    Attributes:
+        leader: position, speed, acceleration, window by window, `(3, H, N, D, L + S)`, SI units;
+            frame by frame in memory, those of two windows once.
+        leader_length: `(N, D)`, m.
+        follower: position, speed, acceleration of the last L frames before the policy takes over,
+            `(3, N, D, L)`, SI units.
+        memory: of the model at that moment, `(N, D, m)`.
+        latent: of the head at that moment, `(N, D, q)`: nothing is drawn yet.
+        measured: at the `H S` frames that are simulated.
+    """
+
+    leader: Tensor
+    leader_length: Tensor
+    follower: Tensor
+    memory: Tensor
+    latent: Tensor
+    measured: Measured
+
+    @classmethod
+    def of(
+        cls, pairs: PairBatch, pair: Tensor, batch: RolloutBatch, step: WindowStep, windows: int
+    ) -> RolloutInputs:
+        """Gathers them.
+
+        Args:
+            pairs: the P pairs.
+            pair: which pair each trajectory is of, `(N, D)`.
+            batch: where the trajectories begin.
+            step: knows L, S and the model.
+            windows: H.
+        """
+        length, stride, device = step.length, step.stride, pair.device
+        now, each = (batch.start * stride)[..., None], pair[..., None]
+        past = now + torch.arange(1 - length, 1, device=device)
+        frames = torch.arange(1 - length, windows * stride + 1, device=device)
+        around = now[..., 0] + frames[:, None, None]
+        simulated = now + torch.arange(1, windows * stride + 1, device=device)
+        origin = _at(pairs.follower_position, each, now)
+        follower = torch.stack(
+            [
+                _at(pairs.follower_position, each, past) - origin,
+                _at(pairs.follower_speed, each, past),
+                _at(pairs.follower_acceleration, each, past),
+            ]
+        )
+        leader = torch.stack(
+            [
+                _at(pairs.leader_position, pair, around) - origin[..., 0],
+                _at(pairs.leader_speed, pair, around),
+                _at(pairs.leader_acceleration, pair, around),
+            ]
+        )
+        speed = _at(pairs.follower_speed, each, simulated)
+        gap = _at(pairs.gap, each, simulated)
+        leader_length = pairs.leader_length[pair]
+        if batch.scale is not None:
+            scale = batch.scale[..., None]
+            follower, speed, gap = follower * scale, speed * scale, gap * scale
+            # The gap is scaled, the vehicle's length is not.
+            zero = torch.zeros_like(leader_length)
+            rear = torch.stack([leader_length, zero, zero])[:, None]
+            leader = (leader - rear) * batch.scale + rear
+        if batch.shift is not None and batch.wider is not None:
+            shift, wider = batch.shift[..., None], batch.wider[..., None]
+            before = (past - now) * step.dt
+            follower = follower + torch.stack(_moved(shift, before, torch.zeros_like(shift)))
+            after = frames[:, None, None] * step.dt
+            leader = leader + torch.stack(_moved(batch.shift, after, batch.wider))
+            speed, gap = speed + shift, gap + wider
+        counted = (simulated <= batch.last[..., None]).to(follower.dtype)
+        memory = step.model.initial_memory(follower[1, ..., -1])
+        latent = memory.new_zeros((*pair.shape, step.core.head.latent_width))
+        measured = Measured(speed, gap, counted)
+        leader = leader.unfold(1, length + stride, stride)
+        return cls(leader, leader_length, follower, memory, latent, measured)
+
+    def initial(self, state: Tensor) -> LoopState:
+        """Returns where the trajectories begin; `state` is the policy's, `(N, D, s)`.
+
+        Where gradients are recorded they flow through the first state too, as through all later
+        ones: otherwise the window step would be compiled once more for it.
+        """
+        position, speed, acceleration = self.follower.unbind(0)
+        begin = LoopState(position, speed, acceleration, self.memory, state, self.latent)
+        if not torch.is_grad_enabled():
+            return begin
+        return LoopState(
+            *(value if value.requires_grad else value.clone().requires_grad_() for value in begin)
+        )
+
+    def measured_at(self, frames: slice) -> Measured:
+        """Returns what was measured at some of the simulated frames."""
+        speed, gap, counted = self.measured
+        return Measured(speed[..., frames], gap[..., frames], counted[..., frames])
+
+    def leader_window(self, window: int) -> LeaderWindow:
+        """Returns the leader around a window."""
+        position, speed, acceleration = self.leader[:, window].contiguous().unbind(0)
+        return LeaderWindow(position, speed, acceleration)
+
+
+def _moved(shift: Tensor, time: Tensor, ahead: Tensor) -> list[Tensor]:
+    """Returns what a faster road adds to position, speed and acceleration at times, s."""
+    position = shift * time + ahead
+    return [position, shift.expand_as(position), torch.zeros_like(position)]
+
+
+def _at(signal: Tensor, pair: Tensor, frames: Tensor) -> Tensor:
+    """Returns a signal `(P, T)` at frames; beyond a recording, its first or last frame."""
+    return signal[pair, frames.clamp(min=0, max=signal.shape[1] - 1)]

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from cfx.learners.rollout.dataset import usual_time_gap
-from cfx.learners.rollout.inputs import RolloutBatch, RolloutInputs
+from cfx.learners.rollout.dataset import RolloutBatch, usual_time_gap
 from cfx.learners.rollout.sampling import Augmentation
 from cfx.learners.rollout.settings import RolloutSettings
+from cfx.learners.rollout.window import RolloutInputs
 from cfx.policies.features import History
 from tests.learners.made import TRUE, gru, module_of, training_data
 

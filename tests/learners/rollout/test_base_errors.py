@@ -9,8 +9,7 @@ import torch
 
 from cfx.calibration.objectives import GapRmse, TheilU
 from cfx.learners.rollout import loss
-from cfx.learners.rollout.dataset import RolloutDataset
-from cfx.learners.rollout.inputs import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.loss import BaseErrors
 from cfx.models.krauss import Krauss
 from cfx.simulation.rollout import MemoryStepper

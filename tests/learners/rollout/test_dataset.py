@@ -10,7 +10,7 @@ import torch
 from cfx.core.parameters import squashed
 from cfx.learners.base import TrainingPairs
 from cfx.learners.rollout import dataset as dataset_module
-from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
+from cfx.learners.rollout.dataset import time_gaps
 from cfx.learners.rollout.loss import BaseErrors
 from cfx.policies.driver_features import measure
 from tests.learners.made import TRUE, batch_of, gru, placed, training_data
@@ -40,8 +40,7 @@ def test_networks_read_the_driver_features_of_each_of_their_drivers() -> None:
 
 def test_networks_of_an_ensemble_keep_other_drivers_for_validation_and_read_alike() -> None:
     data = training_data()
-    generator = torch.Generator().manual_seed(0)
-    dataset = RolloutDataset.of(data, gru(), 0.34, generator, ensemble_size=5)
+    dataset = placed(data, gru(), 0.34, ensemble_size=5)
     assert len({tuple(row) for row in dataset.validates[:5].tolist()}) > 1
     assert dataset.pair[:5].tolist() == [list(range(6))] * 5
     # Both networks learn from the same pairs, which are held once.

@@ -8,10 +8,9 @@ from typing import Any
 import torch
 
 from cfx.learners.base import TrainingData
-from cfx.learners.rollout.inputs import RolloutInputs
 from cfx.learners.rollout.loop import Expert, burn_in
 from cfx.learners.rollout.module import RolloutModule
-from cfx.learners.rollout.window import WindowStep
+from cfx.learners.rollout.window import RolloutInputs, WindowStep
 from cfx.models.direct import Direct
 from cfx.policies.core import AgentCore
 from cfx.policies.heads.offset import OffsetHead
@@ -43,17 +42,17 @@ def test_an_expert_says_what_it_would_do_where_the_student_stands() -> None:
         conditioning = dataset.condition(batch)
         inputs = RolloutInputs.of(dataset.recordings.batch, conditioning.pair, batch, step, 8)
         own = inputs.initial(burn_in(step, dataset, batch, conditioning))
-        state = expert.begin(batch, inputs.leader_length, None)
+        state = expert.begin(batch, None)
         for window in range(8):
             leader = inputs.leader_window(window)
             before = state
-            label, state = expert.label(state, own, leader)
+            label, state = expert.label(state, own, leader, inputs.leader_length)
             own, speed, _ = step.drive_window(
                 own, leader, inputs.leader_length, conditioning.base, conditioning.features
             )
             torch.testing.assert_close(label, speed, rtol=0, atol=1e-6)
         elsewhere = own._replace(speed=own.speed + 1.0)
-        label, _ = expert.label(before, elsewhere, leader)
+        label, _ = expert.label(before, elsewhere, leader, inputs.leader_length)
     assert not torch.allclose(label, speed, atol=0.1)
 
 

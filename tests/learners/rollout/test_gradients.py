@@ -5,13 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.learners.rollout.window import (
-    GradientPath,
-    LoopState,
-    NoGradients,
-    ThroughMemory,
-    ThroughTime,
-)
+from cfx.learners.rollout.window import GradientPath, LoopState
+
+MEMORY = GradientPath(0.5, 1.0, through_motion=False)
 
 
 def a_state() -> LoopState:
@@ -22,7 +18,7 @@ def a_state() -> LoopState:
     return LoopState(*values)
 
 
-@pytest.mark.parametrize("path", [NoGradients(), ThroughTime(0.5, 1.0), ThroughMemory(0.5, 1.0)])
+@pytest.mark.parametrize("path", [GradientPath(0.5, 1.0), MEMORY])
 def test_values_stay_as_they_are(path: GradientPath) -> None:
     state = a_state()
     for after in (path.after_window(state), path.after_segment(state)):
@@ -32,7 +28,7 @@ def test_values_stay_as_they_are(path: GradientPath) -> None:
 
 def test_gradients_decay_and_are_clipped() -> None:
     state = a_state()
-    after = ThroughTime(0.5, 1.0).after_window(state)
+    after = GradientPath(0.5, 1.0).after_window(state)
     factors = torch.tensor([0.4, -1.6, 6.0, torch.nan])
     (after.speed * factors).sum().backward()
     assert state.speed.grad is not None
@@ -42,7 +38,7 @@ def test_gradients_decay_and_are_clipped() -> None:
 
 def test_through_memory_no_gradient_comes_back_through_the_motion() -> None:
     state = a_state()
-    after = ThroughMemory(0.5, 1.0).after_window(state)
+    after = MEMORY.after_window(state)
     torch.stack(list(after)).sum().backward()
     assert state.state.grad is not None
     for value in state[:4]:
@@ -50,9 +46,7 @@ def test_through_memory_no_gradient_comes_back_through_the_motion() -> None:
 
 
 def test_segments_are_cut_apart() -> None:
-    path = ThroughTime(0.5, 1.0, cut_after=4)
-    assert path.segment_length(30) == 4
-    assert ThroughTime(0.5, 1.0).segment_length(30) == NoGradients().segment_length(30) == 30
+    path = GradientPath(0.5, 1.0, cut_after=4)
     state = a_state()
     torch.stack(list(path.after_segment(state))).sum().backward()
     for value in state:

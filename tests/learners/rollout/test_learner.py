@@ -15,6 +15,7 @@ from cfx.core.errors import ConfigError
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.learners.rollout.module import RolloutModule
+from cfx.learners.rollout.shard import checkpoint_path
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.core import Ensemble
@@ -168,11 +169,13 @@ def test_neither_experts_nor_their_students_train_twice(
 def test_a_checkpoint_of_another_training_is_not_taken_up(tmp_path: Path) -> None:
     policy, learner = gru(), RolloutLearner(**QUICK)
     data = training_data(workspace=tmp_path)
-    found = learner.checkpoint(policy, data)
-    assert found == learner.checkpoint(policy, training_data(workspace=tmp_path))
-    assert found != learner.checkpoint(policy, replace(data, seed=1))
-    assert found != learner.checkpoint(policy, replace(data, objective=GapRmse()))
-    assert found != RolloutLearner(**(QUICK | {"steps": 16})).checkpoint(policy, data)
+    found = checkpoint_path(learner.identity(), policy, data)
+    assert found == checkpoint_path(learner.identity(), policy, training_data(workspace=tmp_path))
+    assert found != checkpoint_path(learner.identity(), policy, replace(data, seed=1))
+    assert found != checkpoint_path(learner.identity(), policy, replace(data, objective=GapRmse()))
+    assert found != checkpoint_path(
+        RolloutLearner(**(QUICK | {"steps": 16})).identity(), policy, data
+    )
 
 
 def test_nothing_is_learned_from_validation_drivers() -> None:

@@ -9,10 +9,9 @@ import torch
 
 from cfx.core.parameters import squashed
 from cfx.learners.rollout import RolloutLearner, RolloutSettings
-from cfx.learners.rollout.inputs import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutBatch
 from cfx.learners.rollout.loop import burn_in, simulate
 from cfx.learners.rollout.module import DISPERSIONS, RolloutModule
-from cfx.learners.rollout.window import NoGradients
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
@@ -24,6 +23,7 @@ from tests.learners.made import (
     gru,
     loop,
     module_of,
+    module_with,
     placed,
     training_data,
     untrained,
@@ -46,14 +46,14 @@ def test_training_simulates_what_evaluation_simulates(
     settings = RolloutSettings(**(QUICK | {"head": head}))
     dataset = placed(data, policy, settings.validation, head=head)
     dataset.scaler = result.scaler
-    module = RolloutModule(result.network, dataset, policy, data, settings)
+    module = module_with(result.network, dataset, data, settings)
     if driver_features:  # training measures full trajectories, evaluation what was before
         frame = torch.full_like(data.pairs.network, 200)
         measured = measure(data.batch, driver_features, 0.1, 0 * frame, frame)
         dataset.recordings.driver_features = measured.float()
     batch = batch_of(dataset, torch.full((1, 6), 40))
     with torch.no_grad():
-        segment = next(simulate(module.exact_step, dataset, batch, 11, NoGradients()))
+        segment = next(simulate(module.exact_step, dataset, batch, 11))
     found = loop(result, data, policy, first=200)
     near = {"rtol": 0, "atol": 2e-3}
     torch.testing.assert_close(segment.speed[0].double(), found.speed[:, 1:56], **near)
@@ -68,7 +68,7 @@ def test_training_samples_what_evaluation_samples(model: Any) -> None:
     settings = RolloutSettings(**(QUICK | {"head": "stochastic"}))
     dataset = placed(data, policy, settings.validation, head="stochastic")
     dataset.scaler = result.scaler
-    module = RolloutModule(result.network, dataset, policy, data, settings)
+    module = module_with(result.network, dataset, data, settings)
     batch = batch_of(dataset, torch.full((1, 6), 40))
     generator = torch.Generator().manual_seed(5)
     width = module.exact_step.core.head.noise_width
@@ -77,7 +77,7 @@ def test_training_samples_what_evaluation_samples(model: Any) -> None:
     for _ in range(11):
         drawn.append(torch.randn((6, width), generator=generator, dtype=torch.float64).float())
     noise = torch.stack(drawn)[:, None]
-    about = (module.exact_step, dataset, batch, 11, NoGradients())
+    about = (module.exact_step, dataset, batch, 11)
     with torch.no_grad():
         centre = next(simulate(*about))
         segment = next(simulate(*about, noise=noise))
@@ -96,7 +96,7 @@ def test_a_bounded_burn_in_forgets_what_was_before() -> None:
     features = dataset.scaler.mean.shape[-1]
     blank = torch.full((1, 2), 0.5)
     network = policy.build(features, blank[0], blank, generator)
-    step = RolloutModule(network, dataset, policy, data, RolloutSettings(**QUICK)).exact_step
+    step = module_with(network, dataset, data, RolloutSettings(**QUICK)).exact_step
     cold_start = torch.tensor([[False, False, False, False, False, True]])
     start = torch.tensor([[2, 4, 5, 9, 12, 12]])
     batch = batch_of(dataset, start, cold_start)
@@ -123,12 +123,12 @@ def test_weights_let_each_time_after_the_start_count_alike() -> None:
     settings = RolloutSettings(**options)
     dataset = placed(data, policy, settings.validation, head="residual")
     result = untrained(data, policy, head="residual")
-    module = RolloutModule(result.network, dataset, policy, data, settings)
+    module = module_with(result.network, dataset, data, settings)
     weights = module.loss.frame_weights
     assert weights is not None
     batch = module.sampler.training(0)
     with torch.no_grad():
-        segment = next(simulate(module.exact_step, dataset, batch, 12, NoGradients()))
+        segment = next(simulate(module.exact_step, dataset, batch, 12))
     counted = segment.measured.counted * batch.weight[..., None]
     square = (segment.speed - segment.measured.speed).square() * counted
     error = square.sum((0, 1)) / counted.sum((0, 1))
@@ -150,7 +150,7 @@ def test_the_noise_is_as_wide_as_validation_drivers_want_it(
     settings = RolloutSettings(**(QUICK | {"head": "stochastic", "horizon": 4}))
     dataset = placed(data, policy, settings.validation, head="stochastic")
     result = untrained(data, policy, head="stochastic")
-    module = RolloutModule(result.network, dataset, policy, data, settings)
+    module = module_with(result.network, dataset, data, settings)
     batch = module.sampler.validation_with_history()
     with torch.no_grad():
         assert bool(module._coverage(batch).le(1.0).all())
@@ -174,14 +174,14 @@ def test_the_path_without_noise_counts_beside_sampled_ones() -> None:
     settings = RolloutSettings(**(QUICK | {"head": "stochastic", "horizon": 4, "paths": 3}))
     dataset = placed(data, policy, settings.validation, head="stochastic")
     network = untrained(data, policy, head="stochastic").network
-    module = RolloutModule(network, dataset, policy, data, settings)
+    module = module_with(network, dataset, data, settings)
     batch = module.sampler.training(0)
-    divisors = module.errors.over_horizon(batch)
-    about = (module.exact_step, dataset, batch, 4, NoGradients())
+    divisors = module.shard.errors.over_horizon(batch)
+    about = (module.exact_step, dataset, batch, 4)
     with torch.no_grad():
         centre = module.loss(next(simulate(*about)), divisors)
         noise = module._noise(batch, 4, 3)
-        sampled = next(simulate(*about, noise=noise, paths=3))
+        sampled = next(simulate(*about, noise=noise))
         crps = module.loss.of_paths(sampled, divisors, 3)
         found = exact_losses(module, batch, 4, full=False)
     assert float(crps.min()) > 0
@@ -204,7 +204,7 @@ def test_the_best_weights_are_of_an_epoch_that_samples_paths(
     settings = RolloutSettings(**(QUICK | {"head": head, "epochs": epochs}))
     dataset = placed(data, policy, settings.validation, head=head)
     network = untrained(data, policy, head=head).network
-    module = RolloutModule(network, dataset, policy, data, settings)
+    module = module_with(network, dataset, data, settings)
     module.best_loss = torch.full_like(module.best_loss, 0.5)
     module.on_train_epoch_start()
     assert bool(module.best_loss.isinf().all()) == is_forgotten
@@ -216,7 +216,7 @@ def test_curves_say_in_which_epochs_paths_are_sampled(head: str, sampled: list[i
     settings = RolloutSettings(**(QUICK | {"head": head, "epochs": 4, "paths": 2}))
     dataset = placed(data, policy, settings.validation, head=head)
     network = untrained(data, policy, head=head).network
-    module = RolloutModule(network, dataset, policy, data, settings)
+    module = module_with(network, dataset, data, settings)
     module.rows += [(torch.ones(1), torch.ones(1))] * 4
     curves = module.curves()
     found = None
@@ -227,11 +227,10 @@ def test_curves_say_in_which_epochs_paths_are_sampled(head: str, sampled: list[i
 
 def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full: bool) -> Any:
     """Returns the loss of each trajectory with the exact model, `(N, D)`."""
-    divisors = module.errors.over_horizon(batch)
+    divisors = module.shard.errors.over_horizon(batch)
     if full:
-        divisors = module.errors.over_full_trajectory(batch)
-    path = NoGradients()
-    return next(module.trajectory_losses(module.exact_step, batch, windows, divisors, path))
+        divisors = module.shard.errors.over_full_trajectory(batch)
+    return next(module.trajectory_losses(module.exact_step, batch, windows, divisors))
 
 
 @pytest.mark.parametrize("cold_start_fraction", [0.0, 0.4, 1.0])

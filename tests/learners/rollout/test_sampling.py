@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from cfx.learners.rollout.inputs import RolloutBatch
+from cfx.learners.rollout.dataset import RolloutBatch
 from tests.learners.made import TRUE, module_of, training_data
 
 

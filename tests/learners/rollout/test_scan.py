@@ -13,7 +13,7 @@ from cfx.learners.base import TrainingData
 from cfx.learners.rollout import RolloutSettings, scan, shard
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.module import RolloutModule
-from cfx.learners.rollout.window import NoGradients, ThroughMemory, ThroughTime
+from cfx.learners.rollout.window import GradientPath
 from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
@@ -23,7 +23,7 @@ from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class
 from cfx.policies.lstm import LstmPolicy
 from cfx.simulation.kernel import compiler
-from tests.learners.made import INPUTS, QUICK, training_data
+from tests.learners.made import INPUTS, QUICK, module_with, training_data
 
 pytestmark = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C++ compiler")
 
@@ -42,16 +42,16 @@ def module(data: TrainingData, policy: Policy, **options: Any) -> RolloutModule:
     settings = RolloutSettings(**(QUICK | options))
     generator = torch.Generator().manual_seed(0)
     head = head_class(settings.head).for_model(data.simulator.model)
-    dataset = RolloutDataset.of(data, policy, settings.validation, generator, 1, head)
+    dataset = RolloutDataset.of(data, policy, head, settings, generator)
     network = shard.untrained(policy, dataset, head, generator)
-    return RolloutModule(network, dataset, policy, data, settings)
+    return module_with(network, dataset, data, settings, policy)
 
 
 def both(built: Any, path: Any) -> list[list[Tensor]]:
     """Returns losses and gradients, without and with the compiled loop."""
     step = built.training_window
     batch = built.sampler.training(3)
-    divisors = built.errors.over_horizon(batch)
+    divisors = built.shard.errors.over_horizon(batch)
     scans, found = built.scans, []
     for used in ({}, scans):
         built.scans = used
@@ -81,12 +81,12 @@ CASES = [
 @pytest.mark.parametrize(
     "path",
     [
-        pytest.param(ThroughTime(0.8, 0.5), marks=pytest.mark.slow),
-        ThroughTime(0.9, 1.0, cut_after=4),
+        pytest.param(GradientPath(0.8, 0.5), marks=pytest.mark.slow),
+        GradientPath(0.9, 1.0, cut_after=4),
     ],
 )
 def test_losses_and_gradients_are_those_of_pytorch(
-    model: DrivingModel, kind: Any, options: Any, settings: Any, path: ThroughTime
+    model: DrivingModel, kind: Any, options: Any, settings: Any, path: GradientPath
 ) -> None:
     policy = kind(inputs=INPUTS, hidden_size=8, start="middle", **options)
     data = training_data(model=model, networks=2)
@@ -99,11 +99,11 @@ def test_losses_and_gradients_are_those_of_pytorch(
         torch.testing.assert_close(two, one, rtol=2e-3, atol=2e-3 * scale)
 
 
-@pytest.mark.parametrize("path", [ThroughMemory(0.8, 0.5), NoGradients()])
+@pytest.mark.parametrize("path", [GradientPath(0.8, 0.5, through_motion=False), None])
 def test_other_ways_back(path: Any) -> None:
     policy = GruPolicy(inputs=INPUTS, hidden_size=8, start="middle")
     built = module(training_data(networks=1), policy, **SETTINGS)
-    with torch.set_grad_enabled(not isinstance(path, NoGradients)):
+    with torch.set_grad_enabled(path is not None):
         eager, compiled = both(built, path)
     assert len(eager) == len(compiled)
     for one, two in zip(eager, compiled, strict=True):
@@ -117,7 +117,7 @@ def test_threads_change_no_bit() -> None:
     before = cores_limit()
     for cores in (1, 2):
         limit_cores(cores)
-        found.append(both(built, ThroughTime(0.8, 0.5))[1])
+        found.append(both(built, GradientPath(0.8, 0.5))[1])
     limit_cores(before)
     for one, two in zip(*found, strict=True):
         assert torch.equal(one, two)
@@ -138,7 +138,7 @@ def test_gradients_go_back_through_the_last_windows_observed(
     """Losses are the same; gradients differ by as little as the network forgets."""
     policy = GruPolicy(inputs=INPUTS, hidden_size=8, start="middle")
     built = module(training_data(networks=1), policy, **SETTINGS)
-    path = ThroughTime(0.8, 0.5)
+    path = GradientPath(0.8, 0.5)
     _, whole = both(built, path)
     monkeypatch.setattr(scan, "_REMEMBERED", 10)
     _, last = both(built, path)

@@ -15,10 +15,9 @@ from cfx.core import threads
 from cfx.core.engine import Engine, Report
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner, shard
-from cfx.learners.rollout import train as training
-from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout import module as training
 from cfx.learners.rollout.shard import networks_of_shards
-from tests.learners.made import QUICK, TRUE, gru, training_data
+from tests.learners.made import QUICK, TRUE, gru, placed, training_data
 from tests.scripts import run_script
 
 SHORT = QUICK | {"ensemble_size": 2, "epochs": 3, "steps": 3, "horizon": 6}
@@ -109,7 +108,7 @@ def test_an_interrupted_shard_goes_on_and_finished_ones_are_not_done_again(
             return train(one, stop)
 
     train = training.train
-    monkeypatch.setattr("cfx.learners.rollout.train.train", Broken())
+    monkeypatch.setattr("cfx.learners.rollout.module.train", Broken())
     learner = RolloutLearner(**SHORT)
     monkeypatch.setattr(shard, "_WORTH_A_PROCESS", 0)
     monkeypatch.setattr(threads, "_LIMIT", [1])
@@ -138,8 +137,7 @@ def test_a_worker_without_a_place_for_checkpoints_trains_all_the_same(
 
 def test_small_trainings_are_not_cut() -> None:
     learner = RolloutLearner(**SHORT)
-    data, generator = training_data(networks=4), torch.Generator().manual_seed(0)
-    dataset = RolloutDataset.of(data, gru(), 0.25, generator, ensemble_size=2)
+    dataset = placed(training_data(networks=4), gru(), ensemble_size=2)
     assert networks_of_shards(learner.settings, dataset) == [slice(0, 8)]
     longer = learner.settings.model_copy(update={"epochs": 10_000, "horizon": 30})
     assert networks_of_shards(longer, dataset) == [slice(0, 4), slice(4, 8)]
@@ -161,7 +159,7 @@ def test_shards_keep_two_cores_busy_to_the_end() -> None:
 _SCRIPT = """
 import torch
 from cfx.learners.rollout import RolloutLearner, shard
-from cfx.learners.rollout import train as training
+from cfx.learners.rollout import module as training
 from cfx.core.threads import limit_cores
 from tests.learners.made import TRUE, gru, training_data
 from tests.learners.rollout.test_shard import SHORT
