@@ -7,7 +7,7 @@ may learn from the same; N networks, W windows of the longest training part, n t
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -25,10 +25,17 @@ from cfx.core.local_engine import LocalEngine
 from cfx.data.pairs import PairBatch
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import Scaler
-from cfx.policies.valid_range import ValidRange
+from cfx.policies.features import History, Scaler, measured_history
+from cfx.policies.valid_range import ValidRange, situations
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import Split, WindowSettings
+
+_PAIRS_AT_MOST = 4096
+"""Pairs of a network whose situations are measured: of more, as many at equal distances. A range
+and its quantiles need no more than the hundred thousands of situations that these have."""
+
+Augment = Callable[[History, Tensor], History]
+"""Takes the situations of pairs `(P,)`, `(P, W)` each, and returns others of the same shape."""
 
 CURVE_COLUMNS = ["network", "epoch", "train_loss", "validation_loss"]
 
@@ -120,7 +127,7 @@ class TrainingResult:
         head: what makes parameters of answers (`cfx.policies.heads`); None: `offset` where
             there is a base, otherwise `direct`.
         valid_range: the situations that each network learned from; None: those of its training
-            parts (`cfx.learners.situations`).
+            parts (`learned_range`).
         dispersion: factor on each network's noise, `(N,)`; None: 1, or a head without noise.
     """
 
@@ -197,3 +204,41 @@ class Learner(Component):
     @abstractmethod
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
         """Trains the networks of `policy` on `training_data`."""
+
+
+def learned_range(training_data: TrainingData, augment: Augment | None = None) -> ValidRange:
+    """Measures the situations at the windows of each network's training parts.
+
+    Args:
+        training_data: what the networks learn from.
+        augment: what training made of situations besides; None: nothing.
+    """
+    device = training_data.device
+    last = training_data.pairs.split.frame.to(device)
+    windows = torch.arange(0, int(last.max()) + 1, training_data.windows.stride, device=device)
+    networks = training_data.pairs.network.to(device)
+    rows = _some_of_each(networks, len(training_data.names))
+    pair = training_data.pairs.index.to(device)[rows]
+    history = measured_history(training_data.recorded, pair[:, None], windows, 1)
+    recorded = History(*(signal[..., 0] for signal in history))
+    counted = windows <= last[rows, None]
+    versions = [situations(recorded)]
+    if augment is not None:
+        versions.append(situations(augment(recorded, rows)))
+    found = []
+    for number in range(len(training_data.names)):
+        own = networks[rows] == number
+        found.append(torch.cat([version[own][counted[own]] for version in versions]))
+    return ValidRange.of(found)
+
+
+def _some_of_each(network: Tensor, networks: int) -> Tensor:
+    """Returns rows of each network, all or `_PAIRS_AT_MOST` of them, in order, `(S,)`."""
+    chosen = []
+    for number in range(networks):
+        own = (network == number).nonzero()[:, 0]
+        if len(own) > _PAIRS_AT_MOST:
+            at = torch.arange(_PAIRS_AT_MOST, device=own.device) * len(own) // _PAIRS_AT_MOST
+            own = own[at]
+        chosen.append(own)
+    return torch.cat(chosen).sort().values

@@ -17,12 +17,11 @@ from pydantic import AfterValidator, Field
 
 from cfx.core.component import Settings
 from cfx.core.progress import Task
-from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult, learned_range
 from cfx.learners.curves import warn_of_nothing_learned
-from cfx.learners.situations import learned_range
 from cfx.policies.base import Policy
+from cfx.policies.core import Grid
 from cfx.policies.heads import head_class, trained_head
-from cfx.policies.placement import Grid
 from cfx.simulation.rollout import Compile, can_compile
 
 log = logging.getLogger(__name__)

@@ -21,9 +21,9 @@ from cfx.core.errors import DataError
 from cfx.learners.base import TrainingData
 from cfx.learners.batched import BatchedModule, Training
 from cfx.policies.base import Policy, PolicyNetwork
+from cfx.policies.core import Grid
 from cfx.policies.features import Scaler, measured_history, tokens
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.placement import Grid
 from cfx.simulation.kernel.compiler import torch_compiled
 
 

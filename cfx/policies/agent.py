@@ -14,7 +14,7 @@ that a stochastic head keeps.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -27,18 +27,20 @@ from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.context import UNSEEN, ContextRule, DriverContext, ExpectedError
-from cfx.policies.core import AgentCore
+from cfx.policies.core import ALL, AgentCore, driver_places
 from cfx.policies.driver_features import measure
 from cfx.policies.features import History, Scaler, measured_history
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.offset import blended, shrunk
-from cfx.policies.placement import ALL, driver_places
 from cfx.policies.valid_range import SIGNALS, ValidRange, situation_of, weight_of_answer
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import WindowSettings
 
 if TYPE_CHECKING:
     import pandas as pd
+
+
+_OF_DRIVERS = ("conditioning", "score", "beyond", "latent")
 
 
 class AgentState(NamedTuple):
@@ -76,19 +78,9 @@ class AgentState(NamedTuple):
         shape = (self.state.shape[0], int(place.max()) + 1, *self.state.shape[2:])
         state = self.state.new_zeros(shape)
         state[network, place] = self.state[network, self.place[drivers]]
-        base = None
-        if self.base is not None:
-            base = self.base[drivers]
-        return AgentState(
-            network,
-            place,
-            state,
-            base,
-            self.conditioning[drivers],
-            self.score[drivers],
-            self.beyond[drivers],
-            self.latent[drivers],
-        )
+        kept = {name: getattr(self, name)[drivers] for name in _OF_DRIVERS}
+        base = None if self.base is None else self.base[drivers]
+        return AgentState(network=network, place=place, state=state, base=base, **kept)
 
 
 @dataclass(frozen=True)
@@ -422,30 +414,23 @@ class Agent:
 
     def only(self, numbers: Tensor) -> Agent:
         """Returns the agent with some of its networks, `(M,)` int64, which are numbered anew."""
-
-        def rows(values: Tensor | None) -> Tensor | None:
-            return None if values is None else values[numbers.to(values.device)]
-
-        return replace(
-            self,
-            core=self.core.only(numbers),
-            names=tuple(self.names[number] for number in numbers.tolist()),
-            base=rows(self.base),
-            population=rows(self.population),
-            valid_range=None if self.valid_range is None else self.valid_range.only(numbers),
-            dispersion=rows(self.dispersion),
-        )
+        names = tuple(self.names[number] for number in numbers.tolist())
+        core = self.core.only(numbers)
+        return replace(self._each(lambda of: of[numbers.to(of.device)]), core=core, names=names)
 
     def to(self, device: torch.device) -> Agent:
         """Moves everything to a device."""
-        return replace(
-            self,
-            core=self.core.to(device),
-            base=None if self.base is None else self.base.to(device),
-            population=None if self.population is None else self.population.to(device),
-            valid_range=None if self.valid_range is None else self.valid_range.to(device),
-            dispersion=None if self.dispersion is None else self.dispersion.to(device),
-        )
+        return replace(self._each(lambda of: of.to(device)), core=self.core.to(device))
+
+    def _each(self, change: Callable[[Tensor], Tensor]) -> Agent:
+        """Returns the agent with each tensor of its networks, `(N, ...)`, changed alike."""
+        changed: dict[str, Any] = {}
+        for name in ("base", "population", "dispersion"):
+            value = getattr(self, name)
+            changed[name] = None if value is None else change(value)
+        if self.valid_range is not None:
+            changed["valid_range"] = ValidRange(*map(change, self.valid_range))
+        return replace(self, **changed)
 
     def _answer(self, history: History, state: AgentState) -> tuple[Tensor, AgentState]:
         """Returns the networks' answers `(D, n)`, in the history's dtype, and their state."""
@@ -457,48 +442,33 @@ class Agent:
         self, answer: Tensor, history: History, state: AgentState, noise: Tensor | None
     ) -> tuple[Tensor, AgentState]:
         """Returns parameters `(D, n)`, SI units, that answers mean, and the state afterwards."""
-        state = self._judged(history, state)
+        if self.valid_range is not None:
+            situation = situation_of(history)
+            score = self.valid_range.score(situation, state.network)
+            beyond = self.valid_range.beyond(situation, state.network)
+            state = state._replace(score=score, beyond=beyond)
         unit = self._faded(answer.double(), state).to(answer.dtype)
         chosen = self.head.measured(self.space.from_unit(unit), history, self.dt)
         if noise is None:
             return chosen, state
-        return self._drawn(chosen, state, noise.to(chosen))
-
-    def _drawn(self, chosen: Tensor, state: AgentState, noise: Tensor) -> tuple[Tensor, AgentState]:
-        """Draws the parameters `(D, n)` of a window, SI units, around those that were chosen."""
+        noise = noise.to(chosen)
         if self.dispersion is not None:
             noise = noise * self.dispersion[state.network, None].to(noise)
         window_s = self.windows.stride * self.dt
         drawn, latent = self.head.sampled(chosen, noise, state.latent.to(chosen), window_s)
         return drawn, state._replace(latent=latent.to(state.latent))
 
-    def _judged(self, history: History, state: AgentState) -> AgentState:
-        """Records how far outside the valid range the drivers are."""
-        if self.valid_range is None:
-            return state
-        situation = situation_of(history)
-        return state._replace(
-            score=self.valid_range.score(situation, state.network),
-            beyond=self.valid_range.beyond(situation, state.network),
-        )
-
     def _faded(self, answer: Tensor, state: AgentState) -> Tensor:
         """Returns the parameters `(D, n)`, in unit space, of answers as far as they are used."""
         unit = self.head.unit_parameters(answer, state.base)
-        fallback = self._fallback(state)
+        fallback = state.base
         if fallback is None:
-            return unit
+            if self.population is None:
+                return unit
+            population = self.population[state.network].double()
+            fallback = self.space.to_unit(self.head.completed(population))
         weight = weight_of_answer(state.score)[:, None]
         return torch.where(weight < 1.0, blended(fallback, unit, weight), unit)
-
-    def _fallback(self, state: AgentState) -> Tensor | None:
-        """Returns what is driven with far outside, `(D, n)` in unit space; None if nothing is."""
-        if state.base is not None:
-            return state.base
-        if self.population is None:
-            return None
-        population = self.population[state.network].double()
-        return self.space.to_unit(self.head.completed(population))
 
     def _unit_base(self, network: Tensor, context: DriverContext) -> Tensor | None:
         """Returns the drivers' base in unit space, `(D, n)`, in double precision."""

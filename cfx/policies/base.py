@@ -15,8 +15,8 @@ from pydantic import BeforeValidator, Field
 from torch import Tensor, nn
 
 from cfx.core.component import Component, Settings
-from cfx.policies.driver_features import check_driver_features, named_driver_features
-from cfx.policies.features import SITUATION, Summary, check_inputs, named_inputs
+from cfx.policies.driver_features import DRIVER_FEATURE_SETS, DRIVER_FEATURES
+from cfx.policies.features import INPUT_SETS, INPUTS, SITUATION, Summary, named
 
 if TYPE_CHECKING:
     from cfx.models.base import DrivingModel
@@ -60,10 +60,13 @@ class PolicyNetwork(nn.Module, ABC):
         """
 
 
+_NAMED_FEATURES = named(DRIVER_FEATURE_SETS, DRIVER_FEATURES, "driver feature")
+
+
 class PolicySettings(Settings):
     """Settings of policies that read states."""
 
-    inputs: Annotated[tuple[str, ...], BeforeValidator(named_inputs)] = Field(
+    inputs: Annotated[tuple[str, ...], BeforeValidator(named(INPUT_SETS, INPUTS, "input"))] = Field(
         SITUATION,
         description="signals that the policy sees, of leader_speed, follower_speed, gap,"
         " relative_speed, time_headway, leader_acceleration, follower_acceleration,"
@@ -75,7 +78,7 @@ class PolicySettings(Settings):
         "frames",
         description="how a window's frames become features: frames (all), last, mean, mean_std",
     )
-    driver_features: Annotated[tuple[str, ...], BeforeValidator(named_driver_features)] = Field(
+    driver_features: Annotated[tuple[str, ...], BeforeValidator(_NAMED_FEATURES)] = Field(
         (),
         description="features of a driver, measured from their history, that condition the policy"
         " (learner=rollout): time_headway, time_gap, standstill_gap, speed_difference,"
@@ -111,12 +114,6 @@ class Policy(Component):
     settings: Settings
     trainable: ClassVar[bool] = True
     adapts: ClassVar[bool] = True
-
-    def __init__(self, settings: Settings | None = None, **options: object) -> None:
-        super().__init__(settings, **options)
-        if isinstance(self.settings, PolicySettings):
-            check_inputs(self.settings.inputs)
-            check_driver_features(self.settings.driver_features)
 
     @property
     def untrained_head(self) -> str | None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -52,7 +51,7 @@ def save(agent: Agent, folder: Path) -> None:
     with atomic_write(folder / _TENSORS) as temporary:
         temporary.write_bytes(safetensors.torch.save(tensors))
     with atomic_write(folder / _DESCRIPTION) as temporary:
-        text = json.dumps(_description(agent), indent=2)
+        text = json.dumps(_Description.of(agent).model_dump(mode="json"), indent=2)
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
@@ -75,7 +74,12 @@ def load(folder: Path | str) -> Agent:
     assert isinstance(policy, Policy)
     assert isinstance(model, DrivingModel)
     policy = policy.for_model(model, description.dt, description.windows)
-    head = _head(folder, description, model)
+    if description.head not in registry.names("head"):
+        raise DataError(
+            f"{folder}/{_DESCRIPTION}: this version of cfx has no head '{description.head}'; it has"
+            f" {', '.join(registry.names('head'))}"
+        )
+    head = head_class(description.head).for_model(model)
     try:
         return _agent(description, weights, policy, head)
     except (ValueError, KeyError, TypeError, IndexError, AttributeError, RuntimeError) as error:
@@ -88,21 +92,44 @@ class _Description(BaseModel):
 
     model_config = ConfigDict(extra="ignore", allow_inf_nan=False)
 
+    format: int = _FORMAT
     policy: dict[str, Any]
     model: dict[str, Any]
+    parameters: tuple[str, ...] = Field(min_length=1)
+    head: str
     windows: WindowSettings
     dt: float = Field(gt=0, le=100)
     names: tuple[str, ...] = Field(min_length=1)
-    parameters: tuple[str, ...] = Field(min_length=1)
-    head: str
     ensemble_size: int = Field(ge=1, le=64)
-    own: bool
     shrinkage: float = Field(ge=0, le=1)
+    own: bool
     history: float | None = Field(ge=0)
     combines: bool = False
     learned_from: dict[str, str]
-    recorded: dict[str, tuple[float, ...]]
     expected_error: ExpectedError | None = None
+    recorded: dict[str, tuple[float, ...]]
+
+    @classmethod
+    def of(cls, agent: Agent) -> _Description:
+        """Returns what is said of an agent."""
+        rule, trained_on = agent.context_rule, agent.trained_on
+        return cls(
+            policy=dict(agent.policy_node),
+            model=dict(agent.model_node),
+            parameters=agent.space.names,
+            head=agent.head.name,
+            windows=agent.windows,
+            dt=agent.dt,
+            names=agent.names,
+            ensemble_size=agent.core.ensemble_size,
+            shrinkage=rule.shrinkage,
+            own=rule.driver_specific,
+            history=rule.history_s,
+            combines=rule.combines,
+            learned_from=dict(trained_on.pairs),
+            expected_error=trained_on.expected_error,
+            recorded=dict(trained_on.quantiles),
+        )
 
 
 def _validated(folder: Path, written: Mapping[str, Any]) -> _Description:
@@ -138,19 +165,24 @@ def _agent(
         raise ValueError(f"there are weights of {networks} networks")
     if head.needs_base and "base" not in weights:
         raise ValueError(f"the head '{head.name}' needs 'base'")
-    widths = {"base": len(head.space), "population": len(head.model_space)}
-    for name, width in widths.items():
-        if name in weights and weights[name].shape != (networks, width):
-            raise ValueError(f"'{name}' has the shape {tuple(weights[name].shape)}")
-    if "dispersion" in weights and weights["dispersion"].shape != (networks,):
-        raise ValueError(f"'dispersion' has the shape {tuple(weights['dispersion'].shape)}")
+    signals, shape = len(SIGNALS), (networks,)
+    shapes = {
+        "base": (*shape, len(head.space)),
+        "population": (*shape, len(head.model_space)),
+        "dispersion": shape,
+        f"{_RANGE}mean": (*shape, signals),
+        f"{_RANGE}precision": (*shape, signals, signals),
+        f"{_RANGE}distance": shape,
+        f"{_RANGE}low": (*shape, signals),
+        f"{_RANGE}high": (*shape, signals),
+    }
     for name, value in weights.items():
+        if value.shape != shapes.get(name, value.shape):
+            raise ValueError(f"'{name}' has the shape {tuple(value.shape)}")
         if not bool(value.isfinite().all()):
             raise ValueError(f"'{name}' holds a number that is not finite")
-    trained = {}
-    for name, value in weights.items():
-        if name.startswith("network."):
-            trained[name.removeprefix("network.")] = value
+    valid_range = _named(weights, _RANGE)
+    trained = _named(weights, "network.")
     network = network_with_weights(policy, trained, description.ensemble_size, scaler, head.answers)
     return Agent(
         core=AgentCore(policy, network, scaler, head),
@@ -170,7 +202,7 @@ def _agent(
         trained_on=TrainedOn(
             description.learned_from, description.recorded, description.expected_error
         ),
-        valid_range=_valid_range(weights),
+        valid_range=ValidRange(**valid_range) if valid_range else None,
         dispersion=weights.get("dispersion"),
     )
 
@@ -181,59 +213,19 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
         tensors[f"network.{name}"] = value.cpu()
     for name, value in agent.scaler.state_dict().items():
         tensors[f"scaler.{name}"] = value.cpu()
-    if agent.base is not None:
-        tensors["base"] = agent.base.cpu()
-    if agent.population is not None:
-        tensors["population"] = agent.population.cpu()
-    if agent.dispersion is not None:
-        tensors["dispersion"] = agent.dispersion.cpu()
+    for name in ("base", "population", "dispersion"):
+        value = getattr(agent, name)
+        if value is not None:
+            tensors[name] = value.cpu()
     if agent.valid_range is not None:
-        for name, value in agent.valid_range.state_dict().items():
+        for name, value in agent.valid_range._asdict().items():
             tensors[f"{_RANGE}{name}"] = value.cpu()
     return tensors
 
 
-def _valid_range(weights: Mapping[str, Tensor]) -> ValidRange | None:
-    found = {}
-    for name, value in weights.items():
-        if name.startswith(_RANGE):
-            found[name.removeprefix(_RANGE)] = value
-    if not found:
-        return None
-    valid_range = ValidRange(**found)
-    networks, signals = len(weights["scaler.mean"]), len(SIGNALS)
-    expected = [
-        (networks, signals),
-        (networks, signals, signals),
-        (networks,),
-        (networks, signals),
-        (networks, signals),
-    ]
-    if [tuple(value.shape) for value in valid_range.state_dict().values()] != expected:
-        raise ValueError("the valid range has another shape")
-    return valid_range
-
-
-def _description(agent: Agent) -> dict[str, Any]:
-    rule, expected = agent.context_rule, agent.trained_on.expected_error
-    return {
-        "format": _FORMAT,
-        "policy": dict(agent.policy_node),
-        "model": dict(agent.model_node),
-        "parameters": list(agent.space.names),
-        "head": agent.head.name,
-        "windows": agent.windows.model_dump(),
-        "dt": agent.dt,
-        "names": list(agent.names),
-        "ensemble_size": agent.core.ensemble_size,
-        "shrinkage": rule.shrinkage,
-        "own": rule.driver_specific,
-        "history": rule.history_s,
-        "combines": rule.combines,
-        "learned_from": dict(agent.trained_on.pairs),
-        "expected_error": None if expected is None else asdict(expected),
-        "recorded": {name: list(values) for name, values in agent.trained_on.quantiles.items()},
-    }
+def _named(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+    """Returns the tensors whose names have a prefix, without it."""
+    return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
@@ -253,12 +245,3 @@ def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
             f" reads format {_FORMAT}"
         )
     return description, weights
-
-
-def _head(folder: Path, description: _Description, model: DrivingModel) -> ParameterHead:
-    if description.head not in registry.names("head"):
-        raise DataError(
-            f"{folder}/{_DESCRIPTION}: this version of cfx has no head '{description.head}'; it has"
-            f" {', '.join(registry.names('head'))}"
-        )
-    return head_class(description.head).for_model(model)

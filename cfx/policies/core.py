@@ -1,13 +1,13 @@
-"""Networks on a grid: what training through the simulation, evaluation and live drivers share.
+"""Networks on a grid of places: what training, evaluation and live drivers share.
 
-Shapes: N networks, D drivers of each, L frames of a token, f features of a token, c features of
-conditioning, n tuned parameters, s width of the policy's state. `*batch` are any leading
-dimensions.
+Shapes: N networks, D drivers of each (or in any order), P pairs, a driver each, B drivers of the
+network that has most, L frames of a token, f features of a token, c features of conditioning, n
+tuned parameters, s width of the policy's state. `*batch` are any leading dimensions.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import torch
 from torch import Tensor
@@ -15,6 +15,9 @@ from torch import Tensor
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, Scaler, token_width, tokens
 from cfx.policies.heads.base import ParameterHead
+
+ALL = "all"
+"""Name of the network that is for any driver."""
 
 _EDGE = 1e-6
 
@@ -113,9 +116,7 @@ class AgentCore:
         scaler = Scaler(self.scaler.mean[at], self.scaler.scale[at])
         size = self.ensemble_size
         members = (at[:, None] * size + torch.arange(size, device=at.device)).flatten()
-        weights = {}
-        for name, value in self.network.state_dict().items():
-            weights[name] = value[members]
+        weights = {name: value[members] for name, value in self.network.state_dict().items()}
         network = network_with_weights(self.policy, weights, size, scaler, self.head.answers)
         return AgentCore(self.policy, network.to(at.device), scaler, self.head)
 
@@ -165,24 +166,6 @@ class AgentCore:
         after = self.network.observe(self.scaler(features[:, :, None]), state)
         return torch.where(present[..., None], after, state)
 
-    def act(
-        self, history: History, base: Tensor, conditioning: Tensor, state: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Chooses the parameters of the next window in the networks' own precision.
-
-        Args:
-            history: the last L frames, `(N, D, L)` each, SI units.
-            base: `(N, D, n)` in unit space.
-            conditioning: as `condition` returns it, `(N, D, c)`.
-            state: `(N, D, s)`.
-
-        Returns:
-            Parameters `(N, D, n)` in unit space and the networks' state afterwards.
-        """
-        features = torch.cat([self.encode(history), conditioning], -1)
-        answer, after = self.answer(features, state)
-        return self.head.unit_parameters(answer, base), after
-
 
 def ensemble_size(network: PolicyNetwork) -> int:
     """Returns how many networks answer together; 1 where each answers alone."""
@@ -220,3 +203,55 @@ def network_with_weights(
         network = Ensemble(network, size)
     network.load_state_dict(dict(weights))
     return network.eval()
+
+
+def driver_places(network: Tensor) -> Tensor:
+    """Numbers the drivers of each network from 0.
+
+    Args:
+        network: which network each driver has, `(D,)`.
+
+    Returns:
+        `(D,)` int64.
+    """
+    if len(network) == 0:
+        return torch.zeros_like(network)
+    order = torch.argsort(network, stable=True)
+    counts = torch.bincount(network)
+    first = counts.cumsum(0) - counts
+    place = torch.empty_like(order)
+    place[order] = torch.arange(len(network), device=network.device) - first[network[order]]
+    return place
+
+
+def group_by(names: Sequence[str]) -> tuple[Tensor, tuple[str, ...]]:
+    """Groups D drivers by name.
+
+    Returns:
+        The number of each driver's group `(D,)`, and the groups' names in order of appearance.
+    """
+    groups = tuple(dict.fromkeys(names))
+    return torch.tensor([groups.index(name) for name in names]), groups
+
+
+class Grid:
+    """Places P pairs as N networks by B drivers."""
+
+    def __init__(self, network: Tensor, networks: int) -> None:
+        """Takes which network learns from each pair, `(P,)`."""
+        self.network = network
+        self.place = driver_places(network)
+        self.shape = (networks, int(self.place.max()) + 1)
+
+    def scatter(self, values: Tensor) -> Tensor:
+        """Arranges `(P, ...)` as `(N, B, ...)`, zero where a network has fewer drivers."""
+        grid = values.new_zeros((*self.shape, *values.shape[1:]))
+        grid[self.network, self.place] = values
+        return grid
+
+    def mean(self, values: Tensor) -> Tensor:
+        """Returns the mean of `(P, n)` over each network's pairs, `(N, n)`."""
+        networks = self.shape[0]
+        total = values.new_zeros((networks, values.shape[1]))
+        total = total.index_add_(0, self.network, values)
+        return total / torch.bincount(self.network, minlength=networks)[:, None]

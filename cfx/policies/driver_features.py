@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch
-from cfx.policies.features import History, check_names, of_set
+from cfx.policies.features import History
 
 MOVING = 2.0
 """m/s: frames in which the follower is slower say nothing of their time headway."""
@@ -146,16 +146,6 @@ for instance, or acceleration relative to the leader's (correlations of 0.15 and
 
 DRIVER_FEATURE_SETS: dict[str, tuple[str, ...]] = {"all": tuple(DRIVER_FEATURES), "none": ()}
 """Driver features that go by one name: `policy.driver_features=all`."""
-
-
-def named_driver_features(value: object) -> object:
-    """As `of_set`, for driver features."""
-    return of_set(value, DRIVER_FEATURE_SETS, DRIVER_FEATURES, "driver feature")
-
-
-def check_driver_features(names: Sequence[str]) -> None:
-    """As `check_names`, for driver features."""
-    check_names(names, DRIVER_FEATURES, "driver feature")
 
 
 def measure(

@@ -6,13 +6,13 @@ never looks ahead. Shapes: f features of a token, N networks, B drivers of each,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping
 from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from cfx.core.errors import ConfigError, nearest
+from cfx.core.errors import nearest
 from cfx.data.pairs import PairBatch
 
 Summary = Literal["frames", "last", "mean", "mean_std"]
@@ -48,82 +48,34 @@ _STANDING = 1.0
 have poles at 0."""
 
 
-def _leader_speed(history: History) -> Tensor:
-    """m/s."""
-    return history.leader_speed
-
-
-def _leader_acceleration(history: History) -> Tensor:
-    """m/s2."""
-    return history.leader_acceleration
-
-
-def _follower_speed(history: History) -> Tensor:
-    """m/s."""
-    return history.follower_speed
-
-
-def _follower_acceleration(history: History) -> Tensor:
-    """m/s2."""
-    return history.follower_acceleration
-
-
-def _gap(history: History) -> Tensor:
-    """Bumper to bumper, m."""
-    return history.gap
-
-
-def _relative_speed(history: History) -> Tensor:
-    """m/s; positive where the gap grows."""
-    return history.leader_speed - history.follower_speed
-
-
-def _time_headway(history: History) -> Tensor:
-    """Gap over speed, s."""
-    return history.gap / history.follower_speed.clamp(min=_STANDING)
-
-
-def _inverse_time_to_collision(history: History) -> Tensor:
-    """1/s; positive where the gap shrinks."""
-    approach = history.follower_speed - history.leader_speed
-    return approach / history.gap.clamp(min=_STANDING)
-
-
 _FRAME_S = 0.1
 """Time between frames for which jerk is in m/s3; a network's scaler takes out what differs."""
 
 
-def _follower_jerk(history: History) -> Tensor:
-    """Differences of the acceleration between frames, in m/s3 at 0.1 s; the first stands twice."""
-    return _differences(history.follower_acceleration) / _FRAME_S
-
-
-def _leader_jerk(history: History) -> Tensor:
-    """As the follower's."""
-    return _differences(history.leader_acceleration) / _FRAME_S
-
-
-def _differences(signal: Tensor) -> Tensor:
-    """Returns differences between frames `(*batch, length)`; 0 where there is one frame only."""
-    if signal.shape[-1] == 1:
-        return torch.zeros_like(signal)
-    difference = signal.diff(dim=-1)
-    return torch.cat([difference[..., :1], difference], -1)
+def _jerk(acceleration: Tensor) -> Tensor:
+    """Returns jerks `(*batch, length)` at 0.1 s; the first stands twice, and is 0 where alone."""
+    if acceleration.shape[-1] == 1:
+        return torch.zeros_like(acceleration)
+    difference = acceleration.diff(dim=-1)
+    return torch.cat([difference[..., :1], difference], -1) / _FRAME_S
 
 
 INPUTS: dict[str, Callable[[History], Tensor]] = {
-    "leader_speed": _leader_speed,
-    "leader_acceleration": _leader_acceleration,
-    "follower_speed": _follower_speed,
-    "follower_acceleration": _follower_acceleration,
-    "gap": _gap,
-    "relative_speed": _relative_speed,
-    "time_headway": _time_headway,
-    "inverse_time_to_collision": _inverse_time_to_collision,
-    "follower_jerk": _follower_jerk,
-    "leader_jerk": _leader_jerk,
+    "leader_speed": lambda h: h.leader_speed,
+    "leader_acceleration": lambda h: h.leader_acceleration,
+    "follower_speed": lambda h: h.follower_speed,
+    "follower_acceleration": lambda h: h.follower_acceleration,
+    "gap": lambda h: h.gap,
+    "relative_speed": lambda h: h.leader_speed - h.follower_speed,
+    "time_headway": lambda h: h.gap / h.follower_speed.clamp(min=_STANDING),
+    "inverse_time_to_collision": lambda h: (
+        (h.follower_speed - h.leader_speed) / h.gap.clamp(min=_STANDING)
+    ),
+    "follower_jerk": lambda h: _jerk(h.follower_acceleration),
+    "leader_jerk": lambda h: _jerk(h.leader_acceleration),
 }
-"""Signals that a policy may see, each `(*batch, length)`."""
+"""Signals that a policy may see, each `(*batch, length)`, in SI units. The gap is bumper to bumper;
+the relative speed is positive where it grows, the inverse time to collision where it shrinks."""
 
 SITUATION = (
     "leader_speed",
@@ -161,66 +113,47 @@ def _summarised(values: Tensor, summary: Summary) -> list[Tensor]:
     return [values.mean(-1), values.std(-1, correction=0)]
 
 
-def of_set(
-    value: object, sets: Mapping[str, tuple[str, ...]], known: Collection[str], what: str
-) -> object:
-    """Returns the names that a set's name stands for, and whatever else was given as it is.
+def named(
+    sets: Mapping[str, tuple[str, ...]], known: Collection[str], what: str
+) -> Callable[[object], object]:
+    """Returns the check of a setting that is the name of a set, or a list of names and sets.
 
-    In a list a set's name stands for its names.
-
-    Raises:
-        ValueError: it is a name, but not of a set.
-    """
-    if isinstance(value, list | tuple):
-        names: list[object] = []
-        for one in value:
-            names.extend(sets.get(one, (one,)) if isinstance(one, str) else (one,))
-        return tuple(names)
-    if not isinstance(value, str):
-        return value
-    if value not in sets:
-        hint = nearest(value, [*sets, *known])
-        if value in known:
-            hint = f" Write [{value}]."
-        raise ValueError(
-            f"not a set of {what}s.{hint} Give {', '.join(sets)}, or a list of {', '.join(known)}"
-        )
-    return sets[value]
-
-
-def check_names(names: Sequence[str], known: Collection[str], what: str) -> None:
-    """Checks names that a policy's settings give.
+    The check returns names, a set's in its place. It raises ValueError for a name that is unknown
+    or stands twice, and for no name where there is no set `none`.
 
     Args:
-        names: what was given.
+        sets: names that stand for several.
         known: what there is.
         what: one of them in words, such as `input`.
-
-    Raises:
-        ConfigError: a name is unknown or stands twice.
     """
-    setting = f"policy.{what.replace(' ', '_')}s"
-    for name in names:
-        if name not in known:
-            raise ConfigError(
-                f"{setting}: unknown {what} '{name}'.{nearest(name, known)}"
-                f" Known: {', '.join(known)}."
-            )
-    if len(set(names)) != len(names):
-        article = "an" if what[0] in "aeiou" else "a"
-        raise ConfigError(f"{setting}: {article} {what} stands twice in {', '.join(names)}")
 
+    def check(value: object) -> object:
+        if isinstance(value, str):
+            if value not in sets:
+                hint = nearest(value, [*sets, *known])
+                if value in known:
+                    hint = f" Write [{value}]."
+                raise ValueError(
+                    f"not a set of {what}s.{hint} Give {', '.join(sets)}, or a list of"
+                    f" {', '.join(known)}"
+                )
+            return sets[value]
+        if not isinstance(value, list | tuple) or not all(isinstance(one, str) for one in value):
+            return value
+        names: list[str] = []
+        for one in value:
+            names.extend(sets.get(one, (one,)))
+        for name in names:
+            if name not in known:
+                hint = nearest(name, known)
+                raise ValueError(f"unknown {what} '{name}'.{hint} Known: {', '.join(known)}")
+        if len(set(names)) != len(names):
+            raise ValueError(f"one {what} stands twice in {', '.join(names)}")
+        if not names and "none" not in sets:
+            raise ValueError(f"give at least one of {', '.join(known)}")
+        return tuple(names)
 
-def named_inputs(value: object) -> object:
-    """As `of_set`, for inputs."""
-    return of_set(value, INPUT_SETS, INPUTS, "input")
-
-
-def check_inputs(names: Sequence[str]) -> None:
-    """As `check_names`, for inputs, of which there must be one."""
-    if not names:
-        raise ConfigError(f"policy.inputs: give at least one of {', '.join(INPUTS)}")
-    check_names(names, INPUTS, "input")
+    return check
 
 
 def token_width(names: tuple[str, ...], summary: Summary, length: int) -> int:

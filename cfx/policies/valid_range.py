@@ -15,7 +15,7 @@ Shapes: N networks, D drivers, S situations, f = 5 signals.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -59,8 +59,7 @@ _LEAST_VARIANCE = 1e-6
 """Added to variances, so that a signal that never changes does no harm."""
 
 
-@dataclass(frozen=True)
-class ValidRange:
+class ValidRange(NamedTuple):
     """The situations that each of N networks learned from.
 
     Attributes:
@@ -103,10 +102,6 @@ class ValidRange:
         value = situation.to(self.mean)
         return torch.cat([value < self.low[network], value > self.high[network]], -1)
 
-    def only(self, numbers: Tensor) -> ValidRange:
-        """Returns the ranges of some of the N networks, `(M,)` int64."""
-        return ValidRange(*(value[numbers.to(value.device)] for value in self._tensors()))
-
     def joined(self, other: ValidRange) -> ValidRange:
         """Returns one range for what lies in either, by their means and spreads.
 
@@ -124,41 +119,17 @@ class ValidRange:
             torch.maximum(self.high, other.high),
         )
 
-    def to(self, device: torch.device) -> ValidRange:
-        """Returns the same on a device."""
-        return ValidRange(*(value.to(device) for value in self._tensors()))
-
-    def state_dict(self) -> dict[str, Tensor]:
-        """Returns the tensors by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
-    def _tensors(self) -> list[Tensor]:
-        return list(self.state_dict().values())
-
 
 def situation_of(history: History) -> Tensor:
     """Returns the situations at the last frame of histories `(*batch, L)`, `(*batch, f)`."""
-    speed = history.follower_speed[..., -1]
-    return stacked(
-        speed,
-        history.follower_acceleration[..., -1],
-        history.leader_acceleration[..., -1],
-        history.leader_speed[..., -1],
-        history.gap[..., -1],
-    )
+    return situations(History(*(signal[..., -1] for signal in history)))
 
 
-def stacked(
-    speed: Tensor,
-    acceleration: Tensor,
-    leader_acceleration: Tensor,
-    leader_speed: Tensor,
-    gap: Tensor,
-) -> Tensor:
+def situations(h: History) -> Tensor:
     """Returns situations `(*batch, f)` of signals `(*batch,)` each, SI units."""
-    log_gap = torch.log(gap.clamp(min=0.0) + 1.0)
-    signals = [speed, acceleration, leader_acceleration, leader_speed - speed, log_gap]
-    return torch.stack(signals, -1)
+    relative_speed, log_gap = h.leader_speed - h.follower_speed, (h.gap.clamp(min=0.0) + 1.0).log()
+    acceleration, of_leader = h.follower_acceleration, h.leader_acceleration
+    return torch.stack([h.follower_speed, acceleration, of_leader, relative_speed, log_gap], -1)
 
 
 def weight_of_answer(score: Tensor) -> Tensor:
@@ -181,12 +152,9 @@ def recorded_quantiles(batch: PairBatch) -> dict[str, tuple[float, ...]]:
         "acceleration": batch.follower_acceleration[batch.mask],
         "time_gap": batch.gap[batch.mask][moves] / speed[moves],
     }
-    found = {}
+    found: dict[str, tuple[float, ...]] = {}
     for name, values in signals.items():
-        quantiles: tuple[float, ...] = ()
-        if len(values):
-            quantiles = tuple(_quantiles(values, _RECORDED).tolist())
-        found[name] = quantiles
+        found[name] = tuple(_quantiles(values, _RECORDED).tolist()) if len(values) else ()
     return found
 
 

@@ -18,9 +18,9 @@ from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.checkpoint import load, save
 from cfx.policies.context import DriverContext
+from cfx.policies.core import group_by
 from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
-from cfx.policies.placement import group_by
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, Windows, WindowSettings
 from tests.drives import wavy_pairs

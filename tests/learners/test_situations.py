@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.learners import situations
-from cfx.learners.base import TrainingPairs
-from cfx.learners.situations import learned_range
+from cfx.learners import base
+from cfx.learners.base import TrainingPairs, learned_range
 from tests.learners.made import training_data
 
 
@@ -27,9 +26,9 @@ def test_of_many_pairs_as_many_of_each_network_are_measured(
             fixed=data.pairs.fixed[rows],
         ),
     )
-    monkeypatch.setattr(situations, "_PAIRS_AT_MOST", 3)
+    monkeypatch.setattr(base, "_PAIRS_AT_MOST", 3)
     found, expected = learned_range(data), learned_range(some)
     assert torch.equal(found.mean, expected.mean)
     assert torch.equal(found.distance, expected.distance)
-    monkeypatch.setattr(situations, "_PAIRS_AT_MOST", 6)
+    monkeypatch.setattr(base, "_PAIRS_AT_MOST", 6)
     assert not torch.equal(learned_range(data).mean, expected.mean)

@@ -33,7 +33,9 @@ def test_the_grid_and_drivers_in_any_order_get_the_same_parameters(offsets: bool
     base = core.head.space.to_unit(TRUE)[None]
     grid = type(history(50))(*(signal[None] for signal in history(50)))
     initial = core.network.initial_state(1, 3)
-    unit, grid_after = core.act(grid, base, core.condition(base, None), initial)
+    features = torch.cat([core.encode(grid), core.condition(base, None)], -1)
+    answer, grid_after = core.answer(features, initial)
+    unit = core.head.unit_parameters(answer, base)
     torch.testing.assert_close(found, core.head.space.from_unit(unit[0]), rtol=0, atol=1e-12)
     torch.testing.assert_close(after.state, grid_after, rtol=0, atol=1e-12)
 

@@ -6,7 +6,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfx.policies.placement import driver_places
+from cfx.policies.core import driver_places
 
 
 @given(st.lists(st.integers(0, 5), max_size=30))

@@ -10,7 +10,7 @@ import torch
 from cfx.policies import valid_range
 from cfx.policies.context import DriverContext
 from cfx.policies.features import History
-from cfx.policies.valid_range import FADED, ValidRange, share_in_words, stacked, weight_of_answer
+from cfx.policies.valid_range import FADED, ValidRange, share_in_words, situations, weight_of_answer
 from tests.agents import adaptive
 
 
@@ -21,7 +21,8 @@ def learned(count: int = 4000) -> torch.Tensor:
     noise = torch.randn((3, count), generator=generator, dtype=torch.float64)
     speed = 15.0 * lots[0]
     gap = 2.0 + 1.5 * speed + noise[0].abs()
-    return stacked(speed, 0.5 * noise[1], 0.5 * noise[2], speed + 0.5 * noise[0], gap)
+    leader = (speed + 0.5 * noise[0], 0.5 * noise[2])
+    return situations(History(*leader, speed, 0.5 * noise[1], gap))
 
 
 RANGE = ValidRange.of([learned()])
@@ -29,8 +30,9 @@ ONE = torch.zeros(1, dtype=torch.int64)
 
 
 def situation(speed: float, gap: float, relative: float = 0.0) -> torch.Tensor:
-    values = [speed, 0.0, 0.0, speed + relative, gap]
-    return stacked(*(torch.tensor([value], dtype=torch.float64) for value in values))
+    values = [speed + relative, 0.0, speed, 0.0, gap]
+    signals = (torch.tensor([value], dtype=torch.float64) for value in values)
+    return situations(History(*signals))
 
 
 def history(speed: float, gap: float) -> History:
@@ -95,9 +97,8 @@ def test_each_network_has_its_own_range() -> None:
     where = learned()[:5]
     zeros, ones = torch.zeros(5, dtype=torch.int64), torch.ones(5, dtype=torch.int64)
     assert bool((both.score(where, zeros) < both.score(where, ones)).all())
-    torch.testing.assert_close(
-        both.only(torch.tensor([1])).score(where, zeros), both.score(where, ones)
-    )
+    alone = ValidRange.of([shifted]).score(where, zeros)
+    torch.testing.assert_close(alone, both.score(where, ones))
 
 
 def test_words_say_how_much_and_why() -> None:

@@ -23,8 +23,8 @@ from cfx.evaluation.tables import values_of
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.policies.agent import Agent
 from cfx.policies.context import ContextRule, ExpectedError
+from cfx.policies.core import ALL
 from cfx.policies.heads.offset import shrunk
-from cfx.policies.placement import ALL
 from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)

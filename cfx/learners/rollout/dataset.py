@@ -22,10 +22,10 @@ from cfx.data.pairs import SIGNALS, PairBatch
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.policies.base import Policy
+from cfx.policies.core import Grid
 from cfx.policies.driver_features import measure
 from cfx.policies.features import Scaler, measured_history, tokens
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.placement import Grid
 
 _FEW_DRIVERS = 5
 """A network with fewer drivers keeps the end of each trajectory for validation, not drivers."""

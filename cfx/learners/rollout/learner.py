@@ -26,7 +26,7 @@ from cfx.core import registry
 from cfx.core.component import Settings
 from cfx.core.errors import ConfigError, DataError
 from cfx.core.progress import Task
-from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
+from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult, learned_range
 from cfx.learners.curves import warn_of_nothing_learned
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
 from cfx.learners.rollout.sampling import Augmentation
@@ -41,7 +41,6 @@ from cfx.learners.rollout.shard import (
     shard_checkpoints,
     untrained,
 )
-from cfx.learners.situations import learned_range
 from cfx.policies import checkpoint as saved
 from cfx.policies.agent import Agent
 from cfx.policies.base import Policy, PolicyNetwork

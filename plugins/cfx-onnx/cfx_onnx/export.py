@@ -15,8 +15,8 @@ from cfx.core.errors import ConfigError, DataError
 from cfx.core.files import write_output
 from cfx.policies.agent import Agent
 from cfx.policies.checkpoint import load
+from cfx.policies.core import ALL
 from cfx.policies.driver_step import DriverStep
-from cfx.policies.placement import ALL
 from cfx.results.tracker import folder_of
 from cfx_onnx.agreement import largest_difference
 from cfx_onnx.card import card

@@ -19,7 +19,7 @@ from cfx.data.tidy import TidyDataset, frame_of, write_tidy
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.protocols.finished import Transfer
 from cfx.policies import checkpoint
-from cfx.policies.placement import ALL
+from cfx.policies.core import ALL
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 

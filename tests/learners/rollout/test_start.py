@@ -14,7 +14,7 @@ from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.models.w99 import W99
 from cfx.policies.checkpoint import save
-from cfx.policies.placement import ALL
+from cfx.policies.core import ALL
 from cfx.simulation.windows import WindowSettings
 from tests.learners.made import QUICK, gru, loop, ready, training_data
 

@@ -20,7 +20,7 @@ from cfx.core.errors import DataError, SumoError
 from cfx.core.processes import worker_pool
 from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.policies.agent import Agent
-from cfx.policies.placement import ALL
+from cfx.policies.core import ALL
 from cfx_report.figures.trajectories import evenly_spread
 from cfx_sumo.demo.motorway import ABREAST, Motorway
 from cfx_sumo.demo.replay import FOLLOWERS, ReplayRequest, replay

@@ -10,7 +10,7 @@ import torch
 
 from cfx.core.errors import DataError
 from cfx.core.threads import one_thread
-from cfx.policies.placement import ALL
+from cfx.policies.core import ALL
 from cfx_sumo.live.driver import Driver, DriverOptions, Together
 from cfx_sumo.live.saved import read_state, write_state
 from cfx_sumo.live.surroundings import Connection
