@@ -71,6 +71,11 @@ class TrainingPairs:
     def __len__(self) -> int:
         return len(self.index)
 
+    @property
+    def known_drivers(self) -> tuple[str, ...]:
+        """Whose pair each is; each is another driver's where none is named."""
+        return self.drivers or tuple(str(number) for number in range(len(self)))
+
 
 @dataclass(frozen=True)
 class TrainingData:

@@ -9,7 +9,7 @@ features, c = n + k features of conditioning.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -131,13 +131,7 @@ class Recordings:
 
     def __getitem__(self, rows: Tensor) -> Recordings:
         """Returns some of the pairs."""
-        return Recordings(
-            self.batch[rows],
-            self.pair[rows],
-            self.tokens[rows],
-            self.driver_features[rows],
-            self.time_gap[rows],
-        )
+        return Recordings(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass
@@ -203,17 +197,16 @@ class RolloutDataset:
         present = grid.scatter(torch.ones_like(pairs)).bool().repeat_interleave(ensemble_size, 0)
         pooled = grid.mean(space.to_unit(fixed)).float()
         last = training_data.pairs.split.frame.to(device)[pair]
-        validation = _validation_drivers(training_data, pair.cpu(), present.cpu(), share, generator)
-        kept, few = validation.kept.to(device), validation.few.to(device)[:, None]
+        kept, few = _validation_drivers(training_data, pair.cpu(), present.cpu(), share, generator)
+        kept, few = kept.to(device), few.to(device)[:, None]
         trains = present & (few | ~kept)
         until = torch.where(few, (last * (1.0 - share)).long(), last)
-        if training_data.pairs.base is None:
-            base = space.to_unit(fixed).float()
-        else:
-            base = space.to_unit(head.completed(training_data.pairs.base)).float()
+        base = training_data.pairs.base
+        base = space.to_unit(fixed if base is None else head.completed(base)).float()
         frame = training_data.pairs.split.frame.to(device)[recorded]
         seen = _measured_tokens(training_data, policy, batch, frame)
         driver_features = _driver_features(training_data, policy, batch, frame)
+        time_gap = usual_time_gaps(batch, frame, torch.arange(len(batch), device=device))
         of_driver = row[pair]
         # Whatever a member of the ensemble trains on counts, so that all members share one scaler.
         trained_by_any = trains.view(-1, ensemble_size, trains.shape[1]).any(1)
@@ -223,9 +216,7 @@ class RolloutDataset:
         placed = base[pair]
         scaler = _scaler(seen, placed[first], driver_features, of_driver[first], counted)
         return cls(
-            recordings=Recordings(
-                batch, recorded, seen, driver_features, _usual_time_gaps(batch, frame)
-            ),
+            recordings=Recordings(batch, recorded, seen, driver_features, time_gap),
             pair=of_driver,
             trains=trains,
             validates=present & (few | kept) & (share > 0),
@@ -331,22 +322,13 @@ class RolloutDataset:
     def _sample(self, wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Samples `count` places of each network, `(N, count)`, in order.
 
-        Args:
-            wanted: places to take first, bool `(N, B)`; others follow where there are too few.
-            count: how many.
-            generator: on the CPU.
+        Those that are wanted, bool `(N, B)`, are taken first; others follow where they are too few.
         """
         draws = self.uniform(tuple(wanted.shape[1:]), generator)
         return torch.where(wanted, draws, -1.0).topk(count, dim=1).indices.sort(1).values
 
     def _draw(self, chance: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        """Draws `count` places of each network with replacement, `(N, count)`, in order.
-
-        Args:
-            chance: of each place, `(N, B)`.
-            count: how many.
-            generator: on the CPU.
-        """
+        """Draws `count` places of each network with replacement, `(N, count)`, in order."""
         upto = chance.cumsum(1)
         draws = self.uniform((count,), generator) * upto[:, -1:]
         places = torch.searchsorted(upto, draws, right=True)
@@ -424,18 +406,11 @@ def chances(sites: Sequence[str], drivers: Sequence[str], frames: Tensor, balanc
 def _chance(
     training_data: TrainingData, pair: Tensor, present: Tensor, balance: float
 ) -> Tensor | None:
-    """Returns how likely each place is sampled, `(N, B)`; None where all are alike.
-
-    Args:
-        pair: which of the P pairs stands at each place, `(N, B)`.
-        present: where one stands.
-        balance: from 0 to 1.
-    """
+    """Returns how likely each place is sampled, `(N, B)`; None where all are alike."""
     if balance == 0:
         return None
-    pairs = len(training_data.pairs)
-    drivers = training_data.pairs.drivers or tuple(str(number) for number in range(pairs))
-    sites = training_data.pairs.sites or ("",) * pairs
+    drivers = training_data.pairs.known_drivers
+    sites = training_data.pairs.sites or ("",) * len(drivers)
     frames = training_data.pairs.split.frame.cpu()
     found = torch.zeros(pair.shape, dtype=torch.float64)
     for network, row in enumerate(pair.cpu()):
@@ -468,43 +443,25 @@ def time_gaps(training_data: TrainingData) -> Tensor:
     """Returns each driver's usual time gap in the training part, `(P,)`, s."""
     recorded, row = _recorded_once(training_data)
     last = training_data.pairs.split.frame.to(training_data.device)[recorded]
-    return _usual_time_gaps(training_data.recorded, last, training_data.pairs.index[recorded])[row]
+    return usual_time_gaps(training_data.recorded, last, training_data.pairs.index[recorded])[row]
 
 
-def _usual_time_gaps(batch: PairBatch, last: Tensor, pair: Tensor | None = None) -> Tensor:
-    """As `usual_time_gap`, some pairs after the other; of pairs `(U,)`, or all."""
-    if pair is None:
-        pair = torch.arange(len(batch), device=last.device)
-    found = []
-    for part in _parts(len(pair)):
-        found.append(usual_time_gap(batch[pair[part]], last[part]))
-    return torch.cat(found)
-
-
-def usual_time_gap(batch: PairBatch, last: Tensor) -> Tensor:
-    """Returns each driver's median time gap while they move, `(P,)`, s.
+def usual_time_gaps(batch: PairBatch, last: Tensor, pair: Tensor) -> Tensor:
+    """Returns drivers' median time gaps while they move, `(U,)`, s.
 
     Args:
         batch: P pairs.
-        last: `(P,)`, the last frame that may be used.
+        last: the last frame that may be used, `(U,)`.
+        pair: which of the P pairs these are, `(U,)`.
     """
     frames = torch.arange(batch.mask.shape[1], device=last.device)
-    moves = (frames <= last[:, None]) & (batch.follower_speed > _MOVING_MPS)
-    time_gap = (batch.gap - _STANDSTILL_M) / batch.follower_speed.clamp(min=_MOVING_MPS)
-    median = torch.where(moves, time_gap, torch.nan).nanmedian(1).values
-    return median.nan_to_num(_TIME_GAPS_S[0]).clamp(*_TIME_GAPS_S)
-
-
-class _Validation(NamedTuple):
-    """The drivers kept for validation.
-
-    Attributes:
-        kept: whether a place's driver is, bool `(N, B)`.
-        few: which networks have too few drivers to keep any, bool `(N,)`.
-    """
-
-    kept: Tensor
-    few: Tensor
+    found = []
+    for part in _parts(len(pair)):
+        some = batch[pair[part]]
+        moves = (frames <= last[part, None]) & (some.follower_speed > _MOVING_MPS)
+        time_gap = (some.gap - _STANDSTILL_M) / some.follower_speed.clamp(min=_MOVING_MPS)
+        found.append(torch.where(moves, time_gap, torch.nan).nanmedian(1).values)
+    return torch.cat(found).nan_to_num(_TIME_GAPS_S[0]).clamp(*_TIME_GAPS_S)
 
 
 def _validation_drivers(
@@ -513,11 +470,14 @@ def _validation_drivers(
     present: Tensor,
     share: float,
     generator: torch.Generator,
-) -> _Validation:
-    """Chooses validation drivers for each network; all pairs of a driver stay together."""
-    drivers = training_data.pairs.drivers
-    if drivers is None:
-        drivers = tuple(str(number) for number in range(len(training_data.pairs)))
+) -> tuple[Tensor, Tensor]:
+    """Chooses validation drivers for each network; all pairs of a driver stay together.
+
+    Returns:
+        Whether a place's driver is kept, bool `(N, B)`, and which networks have too few drivers to
+        keep any, bool `(N,)`.
+    """
+    drivers = training_data.pairs.known_drivers
     kept, few = torch.zeros_like(present), torch.zeros(len(pair), dtype=torch.bool)
     for network in range(len(pair)):
         places = present[network].nonzero()[:, 0].tolist()
@@ -533,7 +493,7 @@ def _validation_drivers(
         chosen = {known[index] for index in order.tolist()}
         for place, driver in driver_at.items():
             kept[network, place] = driver in chosen
-    return _Validation(kept, few)
+    return kept, few
 
 
 def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:

@@ -6,7 +6,7 @@ follow than others.
 
 Shapes: U recorded pairs, N networks (each member of an ensemble counts), B drivers of the network
 that has most, D trajectories of each network, K simulated frames, W windows of the longest pair, n
-parameters that bases have, R pairs with a base each, C most bases of one pair.
+parameters that bases have, R pairs with a base each, C most bases of one pair, F first frames.
 """
 
 from __future__ import annotations
@@ -59,16 +59,14 @@ class BaseErrors:
         over_pair: over the whole training part, `(R, 2)`; of pooled bases alone.
         own: the row of each place's driver with their base, `(N, B)`.
         pooled: with the base of drivers without one of their own.
-        floor: added to the objective.
-        has_unit: whether the objective grows with the trajectories' scale.
+        objective: the job's.
     """
 
     over_windows: Tensor
     over_pair: Tensor
     own: Tensor
     pooled: Tensor
-    floor: float
-    has_unit: bool
+    objective: Objective
 
     @classmethod
     def of(cls, training_data: TrainingData, dataset: RolloutDataset, horizon: int) -> BaseErrors:
@@ -82,20 +80,23 @@ class BaseErrors:
         wanted = torch.cat([pair, torch.cat([own, pooled], 1)], -1)
         rows, row = torch.unique(wanted.flatten(0, 1), dim=0, return_inverse=True)
         row = row.view(networks, 2 * drivers)
-        bases = _Bases.of(rows[:, 0].long(), rows[:, 1:], len(dataset.recordings.batch))
-        simulation = _ConstantParameters(training_data, dataset, bases)
+        pair, unit = rows[:, 0].long(), rows[:, 1:]
+        count = torch.bincount(pair, minlength=len(dataset.recordings.batch))
+        first = count.cumsum(0) - count
+        place = torch.arange(len(pair), device=pair.device) - first[pair]
+        number = torch.arange(int(count.max()), device=pair.device)
+        # A pair with fewer bases than another has one of them several times.
+        bases = unit[first[:, None] + torch.minimum(number, count[:, None] - 1)]
         stride = training_data.windows.stride
         frames = torch.arange(dataset.recordings.tokens.shape[1], device=own.device) * stride
-        over_windows = simulation.errors(frames, horizon * stride)
-        over_pair = simulation.errors(frames[:1], int(dataset.last.max()))[:, 0]
-        objective = training_data.objective
+        over_windows = _errors(training_data, dataset, bases, frames, horizon * stride)
+        over_pair = _errors(training_data, dataset, bases, frames[:1], int(dataset.last.max()))
         return cls(
-            over_windows,
-            over_pair,
+            over_windows[pair, :, place],
+            over_pair[pair, 0, place],
             row[:, :drivers],
             row[:, drivers:],
-            objective.floor,
-            bool(objective.unit),
+            training_data.objective,
         )
 
     def only(self, networks: slice) -> BaseErrors:
@@ -126,96 +127,58 @@ class BaseErrors:
         objective, gap = errors[..., 0], errors[..., 1]
         if batch.scale is not None:
             gap = gap * batch.scale
-            if self.has_unit:
+            # An objective with a unit grows with the trajectories' scale.
+            if self.objective.unit:
                 objective = objective * batch.scale
-        return Divisors((objective + self.floor).clamp(min=_LEAST_DIVISOR), gap + _LEAST_GAP)
+        objective = (objective + self.objective.floor).clamp(min=_LEAST_DIVISOR)
+        return Divisors(objective, gap + _LEAST_GAP)
 
 
-class _Bases(NamedTuple):
-    """The bases of each pair, as candidates of one simulation.
+@torch.no_grad()
+def _errors(
+    training_data: TrainingData, dataset: RolloutDataset, bases: Tensor, frames: Tensor, steps: int
+) -> Tensor:
+    """Simulates all bases of all pairs from some frames on.
 
-    Attributes:
-        unit: in unit space, `(U, C, n)`; a pair with fewer bases has one of them several times.
-        pair, place: where each of the R bases stands, `(R,)`.
+    Args:
+        training_data: the recordings, and what simulates.
+        dataset: which of them are learned from.
+        bases: of each pair, in unit space, `(U, C, n)`.
+        frames: at which trajectories begin, `(F,)`.
+        steps: how many each lasts at most.
+
+    Returns:
+        The objective and the gap's RMSE, `(U, F, C, 2)`, in single precision.
     """
-
-    unit: Tensor
-    pair: Tensor
-    place: Tensor
-
-    @classmethod
-    def of(cls, pair: Tensor, unit: Tensor, pairs: int) -> _Bases:
-        """Arranges bases.
-
-        Args:
-            pair: which pair each base is of, in order, `(R,)`.
-            unit: in unit space, `(R, n)`.
-            pairs: U.
-        """
-        count = torch.bincount(pair, minlength=pairs)
-        first = count.cumsum(0) - count
-        place = torch.arange(len(pair), device=pair.device) - first[pair]
-        of_pair = torch.arange(int(count.max()), device=pair.device)
-        chosen = first[:, None] + torch.minimum(of_pair, count[:, None] - 1)
-        return cls(unit[chosen], pair, place)
-
-
-class _ConstantParameters:
-    """Simulates all bases of all pairs from some frames on."""
-
-    def __init__(self, training_data: TrainingData, dataset: RolloutDataset, bases: _Bases) -> None:
-        self.simulator = training_data.simulator
-        self.objective = training_data.objective
-        self.batch = training_data.recorded
-        self.pair = training_data.pairs.index[dataset.recordings.pair]
-        frame = training_data.pairs.split.frame.to(dataset.recordings.pair.device)
-        self.last = frame[dataset.recordings.pair]
-        self.bases = bases
-
-    @torch.no_grad()
-    def errors(self, frames: Tensor, steps: int) -> Tensor:
-        """Returns the objective and the gap's RMSE, `(R, F, 2)`, in single precision.
-
-        Args:
-            frames: at which trajectories begin, `(F,)`.
-            steps: how many each lasts at most.
-        """
-        size = max(1, _AT_ONCE // (len(frames) * steps))
-        parts = []
-        for first in range(0, len(self.last), size):
-            parts.append(self._part(slice(first, first + size), frames, steps).float())
-        return torch.cat(parts)[self.bases.pair, :, self.bases.place]
-
-    def _part(self, which: slice, frames: Tensor, steps: int) -> Tensor:
-        """Returns the errors of some pairs, `(pairs, F, C, 2)`."""
-        last, unit = self.last[which], self.bases.unit[which]
-        pairs, windows, bases = len(last), len(frames), unit.shape[1]
-        pair = torch.arange(pairs, device=last.device).repeat_interleave(windows)
-        first = frames.repeat(pairs)
+    simulator, rows = training_data.simulator, dataset.recordings.pair
+    recorded = training_data.pairs.index[rows]
+    last = training_data.pairs.split.frame.to(rows.device)[rows]
+    # What heads answer beyond the model's parameters stands behind them, and is left out.
+    space = simulator.model.adaptation_space
+    bases = bases[..., : len(space)]
+    # Whether a kernel pays is asked for all parts together.
+    simulator = simulator.for_work(len(last) * len(frames) * steps * bases.shape[1])
+    size = max(1, _AT_ONCE // (len(frames) * steps))
+    parts = []
+    for some in range(0, len(last), size):
+        which = slice(some, some + size)
+        count, batch = len(last[which]), training_data.recorded[recorded[which]]
+        pair = torch.arange(count, device=rows.device).repeat_interleave(len(frames))
+        first = frames.repeat(count)
         losses = SegmentLosses.of_segments(
-            self.simulator,
-            self.objective,
-            self.batch[self.pair[which]],
+            simulator,
+            training_data.objective,
+            batch,
             pair,
-            first.clamp(max=self.batch.mask.shape[1] - 1),
-            (last[pair] - first).clamp(0, steps),
+            first.clamp(max=batch.mask.shape[1] - 1),
+            (last[which][pair] - first).clamp(0, steps),
         )
-        # Whether a kernel pays is asked for all parts together.
-        work = len(self.last) * windows * steps * bases
-        losses = replace(losses, simulator=self.simulator.for_work(work))
-        p = self._by_name(unit.to(losses.segments.counted.dtype), windows)
-        objective = losses(p)
-        gap = replace(losses, objective=GapRmse())(p)
-        return torch.stack([objective, gap], -1).view(pairs, windows, bases, 2)
-
-    def _by_name(self, unit: Tensor, windows: int) -> dict[str, Tensor]:
-        """Returns the model's parameters by name, those that differ as `(pairs windows, C)`.
-
-        What heads answer beyond them stands behind them, and is left out.
-        """
-        space = self.simulator.model.adaptation_space
-        values = space.from_unit(unit[..., : len(space)]).repeat_interleave(windows, 0)
-        return {name: value.contiguous() for name, value in space.unpack(values).items()}
+        unit = bases[which].to(losses.segments.counted.dtype)
+        values = space.from_unit(unit).repeat_interleave(len(frames), 0)
+        p = {name: value.contiguous() for name, value in space.unpack(values).items()}
+        errors = torch.stack([losses(p), replace(losses, objective=GapRmse())(p)], -1)
+        parts.append(errors.view(count, len(frames), -1, 2).float())
+    return torch.cat(parts)
 
 
 _EPSILON = 1e-4

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from cfx.learners.rollout.dataset import RolloutBatch, usual_time_gap
+from cfx.learners.rollout.dataset import RolloutBatch, usual_time_gaps
 from cfx.learners.rollout.sampling import Augmentation
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.window import RolloutInputs
@@ -71,7 +71,7 @@ def test_some_cold_starts_are_faster_and_their_gap_fits() -> None:
 
 
 def test_time_gaps_are_those_of_people() -> None:
-    found = usual_time_gap(DATA.batch, DATA.pairs.split.frame)
+    found = usual_time_gaps(DATA.batch, DATA.pairs.split.frame, DATA.pairs.index)
     assert bool(((found >= 0.8) & (found <= 2.5)).all())
 
 

@@ -39,7 +39,7 @@ def test_errors_are_those_of_the_jobs_objective() -> None:
     gap = BaseErrors.of(replace(data, objective=GapRmse()), dataset, 12)
     assert torch.equal(gap.over_windows[..., 0], speed.over_windows[..., 1])
     assert torch.equal(gap.over_windows[..., 1], speed.over_windows[..., 1])
-    assert (speed.floor, gap.floor) == (0.2, 1.0)
+    assert (speed.objective.floor, gap.objective.floor) == (0.2, 1.0)
 
 
 def test_divisors_grow_with_the_scale_of_a_trajectory_where_the_objective_has_a_unit() -> None:
