@@ -218,7 +218,7 @@ class Fit:
         from cfx.calibration.identifiability import training_errors
         from cfx.evaluation.closed_loop import Followers, simulate_in_shards
         from cfx.evaluation.evaluate import closed_loop_errors
-        from cfx.policies.fixed import FixedPolicy
+        from cfx.policies.constant import FixedPolicy
 
         context, parameters = self._context, self._tensor(method)
         batch = context.batch

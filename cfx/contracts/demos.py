@@ -18,7 +18,7 @@ from cfx.evaluation.demo import Demo
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.protocols.within_driver import WithinDriver
 from cfx.policies import checkpoint
-from cfx.policies.fixed import FixedPolicy
+from cfx.policies.constant import FixedPolicy
 from cfx.simulation.synthetic import SyntheticDataset
 
 

@@ -28,8 +28,8 @@ from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResu
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.base import Policy
-from cfx.policies.fixed import FixedPolicy
-from cfx.policies.gru import GruPolicy
+from cfx.policies.constant import FixedPolicy
+from cfx.policies.recurrent import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import WindowSettings

@@ -171,7 +171,7 @@ class Policy(Component):
 
 
 class ConstantNetwork(PolicyNetwork):
-    """Answers the same parameters whatever it sees: the baselines `default` and `fixed`."""
+    """Answers the same parameters whatever it sees."""
 
     def __init__(self, unit: Tensor) -> None:
         """Takes `(N, n)` in unit space."""

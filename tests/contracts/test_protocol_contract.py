@@ -16,7 +16,7 @@ from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.policies.base import Policy
-from cfx.policies.fixed import FixedPolicy
+from cfx.policies.constant import FixedPolicy
 from cfx.simulation.windows import Split
 
 

@@ -16,12 +16,12 @@ from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.agent import Agent
-from cfx.policies.base import ConstantNetwork, Policy
+from cfx.policies.base import Policy
+from cfx.policies.constant import ConstantNetwork, FixedPolicy
 from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler
-from cfx.policies.fixed import FixedPolicy
-from cfx.policies.gru import GruPolicy
-from cfx.policies.heads.direct import DirectHead
+from cfx.policies.heads.base import DirectHead
+from cfx.policies.recurrent import GruPolicy
 from cfx.simulation.rollout import MemoryStepper, simulate
 from cfx.simulation.trajectory import Start
 from cfx.simulation.windows import WindowSettings

@@ -28,7 +28,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler, token_width
 from cfx.policies.heads import head_class
-from cfx.policies.heads.direct import DirectHead
+from cfx.policies.heads.base import DirectHead
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import WindowSettings
 from cfx_estimators.estimator import EstimatorPolicy

@@ -20,13 +20,11 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
-from cfx.policies.base import ConstantNetwork
+from cfx.policies.constant import ConstantNetwork, DefaultPolicy, FixedPolicy
 from cfx.policies.context import ContextRule
 from cfx.policies.core import AgentCore
-from cfx.policies.default import DefaultPolicy
 from cfx.policies.features import Scaler
-from cfx.policies.fixed import FixedPolicy
-from cfx.policies.heads.direct import DirectHead
+from cfx.policies.heads.base import DirectHead
 from cfx.policies.heads.offset import shrunk
 from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper

@@ -27,8 +27,7 @@ from cfx.evaluation.protocols.past import (
 )
 from cfx.evaluation.result import Evaluation, Platoon
 from cfx.policies.agent import Agent
-from cfx.policies.default import DefaultPolicy
-from cfx.policies.fixed import FixedPolicy
+from cfx.policies.constant import DefaultPolicy, FixedPolicy
 
 
 @dataclass(frozen=True)

@@ -33,8 +33,8 @@ from cfx.evaluation.closed_loop import ClosedLoop, Followers, OwnParameters, sim
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.result import Array
 from cfx.policies.agent import Agent
+from cfx.policies.constant import FixedPolicy
 from cfx.policies.context import ExpectedError, conformal_bound
-from cfx.policies.fixed import FixedPolicy
 
 EARLIER = 0.6
 """Share of the past on which own parameters are calibrated, to be tested on the rest."""

@@ -18,9 +18,8 @@ from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolRes
 from cfx.evaluation.result import Platoon
 from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.policies.agent import Agent
+from cfx.policies.constant import DefaultPolicy, FixedPolicy
 from cfx.policies.core import ALL, group_by
-from cfx.policies.default import DefaultPolicy
-from cfx.policies.fixed import FixedPolicy
 from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)

@@ -1,4 +1,4 @@
-"""The contract of a parameter head: it turns what networks answer into parameters.
+"""The contract of a parameter head, which turns what networks answer into parameters; the simplest.
 
 Shapes: `*batch` any leading dimensions, N networks, n tuned parameters, c features of conditioning,
 L frames of a token.
@@ -143,3 +143,20 @@ class ParameterHead(ABC):
         Returns:
             `(*batch, n)` in unit space, in the dtype of the answer.
         """
+
+
+class DirectHead(ParameterHead):
+    """Answers are parameters in unit space, within the bounds of calibration."""
+
+    name: ClassVar[str] = "direct"
+    learners: ClassVar[tuple[str, ...]] = ("imitation",)
+
+    @classmethod
+    def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:
+        return cls(model.space, device)
+
+    def untrained_answer(self, fixed: Tensor) -> Tensor:
+        return fixed
+
+    def unit_parameters(self, answer: Tensor, base: Tensor | None) -> Tensor:
+        return answer

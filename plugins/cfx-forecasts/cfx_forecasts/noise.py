@@ -16,9 +16,9 @@ from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.models.composed import TIME
 from cfx.policies.agent import Agent
 from cfx.policies.base import ConstantNetwork
+from cfx.policies.constant import FixedPolicy
 from cfx.policies.core import AgentCore, features_read
 from cfx.policies.features import Scaler
-from cfx.policies.fixed import FixedPolicy
 from cfx.policies.heads.stochastic import SCALE, StochasticHead
 from cfx.simulation.base import Stepper
 from cfx_forecasts.residuals import measure_residuals

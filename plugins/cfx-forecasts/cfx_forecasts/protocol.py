@@ -28,7 +28,7 @@ from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSe
 from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.evaluation.tables import in_text
 from cfx.policies.agent import Agent
-from cfx.policies.fixed import FixedPolicy
+from cfx.policies.constant import FixedPolicy
 from cfx_forecasts.distributions import Recorded, score_distributions
 from cfx_forecasts.errors import forecast_errors, forecast_values, kinematic_paths
 from cfx_forecasts.noise import can_drive, constant_with_noise, residual_noise

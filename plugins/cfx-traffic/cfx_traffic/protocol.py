@@ -20,9 +20,9 @@ from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.policies.agent import Agent, AgentState
+from cfx.policies.constant import FixedPolicy
 from cfx.policies.core import ALL
 from cfx.policies.features import measured_history
-from cfx.policies.fixed import FixedPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx_forecasts.noise import can_drive, constant_with_noise, residual_noise
 from cfx_traffic.measure import UPSTREAM_M, Measured, traffic_of

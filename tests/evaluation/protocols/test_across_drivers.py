@@ -29,7 +29,7 @@ from cfx.models.krauss import Krauss
 from cfx.policies.base import Policy
 from cfx.policies.core import Ensemble
 from cfx.policies.features import History
-from cfx.policies.gru import GruPolicy
+from cfx.policies.recurrent import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split, WindowSettings

@@ -19,8 +19,7 @@ from cfx.learners.rollout.shard import checkpoint_path
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.core import Ensemble
-from cfx.policies.gru import GruPolicy
-from cfx.policies.lstm import LstmPolicy
+from cfx.policies.recurrent import GruPolicy, LstmPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.learners.made import (
     COMPILED,

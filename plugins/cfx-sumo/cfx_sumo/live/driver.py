@@ -31,11 +31,11 @@ from cfx.models.limits import at_limits
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.base import ConstantNetwork
 from cfx.policies.checkpoint import load as load_checkpoint
+from cfx.policies.constant import FixedPolicy
 from cfx.policies.context import DriverContext
 from cfx.policies.core import ALL, AgentCore
 from cfx.policies.features import History, Scaler
-from cfx.policies.fixed import FixedPolicy
-from cfx.policies.heads.direct import DirectHead
+from cfx.policies.heads.base import DirectHead
 from cfx.policies.valid_range import share_in_words
 from cfx.results.tracker import folder_of
 from cfx.simulation.settings import WindowSettings

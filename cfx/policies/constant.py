@@ -1,4 +1,4 @@
-"""The baseline `fixed`: the calibrated parameters, always."""
+"""Policies of constant parameters, which no learner trains: the baselines `default` and `fixed`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork, ResidualSe
 
 
 class FixedPolicy(Policy):
-    """Answers the fixed parameters that calibration found."""
+    """Answers the fixed parameters that calibration found, always."""
 
     schema: ClassVar[type[Settings]] = ResidualSettings
     settings: ResidualSettings
@@ -23,3 +23,16 @@ class FixedPolicy(Policy):
         self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
     ) -> PolicyNetwork:
         return ConstantNetwork(fixed)
+
+
+class DefaultPolicy(Policy):
+    """Answers the model's default parameters, always."""
+
+    schema: ClassVar[type[Settings]] = Settings
+    trainable = False
+    adapts = False
+
+    def build(
+        self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
+    ) -> PolicyNetwork:
+        return ConstantNetwork(default.expand_as(fixed))
