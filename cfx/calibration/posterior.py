@@ -34,8 +34,9 @@ class DriverPosteriors(ABC):
         """Returns columns for a row per driver of the table `fits`, `(P,)` each.
 
         `median_NAME`, `low_NAME`, `high_NAME`, `contraction_NAME`, `noise_scale`,
-        `noise_correlation`, `noise_left`, `effective_samples`, and `pareto_k` or `r_hat` and
-        `divergences`; the table says what they mean.
+        `noise_correlation`, `noise_left`, `effective_samples`, and `pareto_k` (with
+        `expected_coverage`, if a network has learned) or `r_hat` and `divergences`; the table says
+        what they mean.
         """
 
     @abstractmethod
@@ -58,9 +59,12 @@ class PosteriorMethod(ABC):
 
     Attributes:
         has_population: whether it finds the population that all drivers come from.
+        any_simulator: whether it asks for few enough simulations for simulators that are slower
+            than `simulator=memory`.
     """
 
     has_population: ClassVar[bool] = False
+    any_simulator: ClassVar[bool] = False
 
     @abstractmethod
     def find(

@@ -30,6 +30,10 @@ MIXED = 1.05
 DIVERGENT = 0.01
 """Share of divergent draws above which chains may have left out a part of the posterior."""
 
+OFF = 0.05
+"""Distance from `LEVEL` of what a network's intervals hold of simulated drivers' parameters, above
+which it is said."""
+
 ENOUGH = 100.0
 """Effective samples below which the ends of a 90 % interval move by a tenth of its width or so from
 one seed to the next (the 5 % point of a normal distribution: standard error 0.21 deviations)."""
@@ -46,8 +50,9 @@ class CalibrationSettings(Settings):
     posterior: str = Field(
         "none",
         description="intervals of each driver's parameters beside the point estimate. laplace: each"
-        " driver alone; nuts: the same by chains; hierarchical: with a prior that all drivers of"
-        " the job give; none: the point estimate alone",
+        " driver alone; nuts: the same by chains; sbi: the same by a network that learns from"
+        " simulations, of simulator=sumo too; hierarchical: with a prior that all drivers of the"
+        " job give; none: the point estimate alone",
     )
     noise_step_s: float = Field(
         1.0,

@@ -64,6 +64,7 @@ EXTRAS: dict[tuple[str, str], str] = {
     ("calibration.posterior", "hierarchical"): "cfx-posteriors",
     ("calibration.posterior", "laplace"): "cfx-posteriors",
     ("calibration.posterior", "nuts"): "cfx-posteriors",
+    ("calibration.posterior", "sbi"): "cfx-posteriors[sbi]",
     ("protocol", "forecast"): "cfx-forecasts",
     ("protocol", "traffic"): "cfx-traffic",
     ("simulator", "sumo"): "cfx-sumo",

@@ -9,7 +9,16 @@ from rich.console import RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from cfx.calibration.settings import DETERMINED, DIVERGENT, ENOUGH, LEVEL, MIXED, RELIABLE, reliable
+from cfx.calibration.settings import (
+    DETERMINED,
+    DIVERGENT,
+    ENOUGH,
+    LEVEL,
+    MIXED,
+    OFF,
+    RELIABLE,
+    reliable,
+)
 from cfx.core.parameters import Parameter
 from cfx.results.table import Findings
 
@@ -52,14 +61,16 @@ class KnownParameters:
         """Returns what MLflow keeps too.
 
         `posterior/determined/NAME` and `posterior/reliable` are shares of pairs,
-        `posterior/noise_left` and `posterior/effective_samples` medians.
+        `posterior/noise_left`, `posterior/effective_samples` and `posterior/expected_coverage`
+        (`sbi`) medians.
         """
         found = {}
         for one in self.parameters:
             found[f"posterior/determined/{one.name}"] = self.determined(one.name) / len(self.rows)
         found["posterior/reliable"] = float(self.reliable.mean())
-        for name in ("noise_left", "effective_samples"):
-            found[f"posterior/{name}"] = float(self.rows[name].median())
+        for name in ("noise_left", "effective_samples", "expected_coverage"):
+            if name in self.rows:
+                found[f"posterior/{name}"] = float(self.rows[name].median())
         return found
 
     def printed(self) -> list[RenderableType]:
@@ -94,10 +105,21 @@ class KnownParameters:
                     f"chains differ or leave out a part (r_hat above {MIXED} or divergences above"
                     f" {DIVERGENT}"
                 )
+            such = "too narrow"
+            if "expected_coverage" in self.rows:
+                such = "the network's alone"
             sentences.append(
                 f"Do not rely on the intervals of {len(doubtful)} of {pairs} pairs ({named}):"
-                f" {why} in fits.parquet), and such intervals are too narrow."
+                f" {why} in fits.parquet), and such intervals are {such}."
             )
+        if "expected_coverage" in self.rows:
+            held = float(self.rows["expected_coverage"].median())
+            if abs(held - LEVEL) > OFF:
+                sentences.append(
+                    f"Intervals of the network alone hold {held:.0%} of simulated drivers'"
+                    f" parameters instead of {LEVEL:.0%} (expected_coverage in fits.parquet): it"
+                    " has learned too little."
+                )
         few = int((self.reliable & (self.rows["effective_samples"] < ENOUGH)).sum())
         if few:
             sentences.append(

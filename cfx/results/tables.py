@@ -296,6 +296,12 @@ class Fits(ResultTable):
         Column(
             "pareto_k", "1", "above 0.7 these intervals are not to be relied on", required=False
         ),
+        Column(
+            "expected_coverage",
+            "1",
+            "share of simulated drivers' parameters that the network's 90 % intervals hold (`sbi`)",
+            required=False,
+        ),
         Column("r_hat", "1", "of chains: above 1.05 the same (`nuts`)", required=False),
         Column("divergences", "1", "share of draws: above 0.01 the same (`nuts`)", required=False),
     )

@@ -1,7 +1,9 @@
 """What docs/how-to/uncertainty.md says of `calibration.posterior`: coverage, ranks, I-80, time.
 
 python -m tests.benchmarks.posteriors coverage|recording|forecasts|chains|nuts|covered krauss|idm|w99
+python -m tests.benchmarks.posteriors learned|beside krauss|idm|w99
 python -m tests.benchmarks.posteriors reference idm
+python -m tests.benchmarks.posteriors sumo krauss_sumo
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import blackjax
 import emcee
@@ -23,20 +25,23 @@ from scoringrules import crps_ensemble
 from torch import Tensor
 
 from cfx.calibration.search import RandomSearch
-from cfx.calibration.settings import DETERMINED, MIXED, CalibrationSettings
+from cfx.calibration.settings import DETERMINED, MIXED, RELIABLE, CalibrationSettings
 from cfx.calibration.shards import Solver
+from cfx.core.registry import create
 from cfx.data.pairs import PairBatch
 from cfx.data.tidy import TidyDataset
 from cfx.models.base import DrivingModel
 from cfx.models.idm import CLOSEST, IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
+from cfx.simulation.base import Simulator
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Segments
 from cfx_posteriors.density import DEVIATION, Posterior
-from cfx_posteriors.importance import DRAWS, sample
+from cfx_posteriors.importance import DRAWS, Sampled, sample
 from cfx_posteriors.intervals import LaplaceMethod, posterior_of
 from cfx_posteriors.laplace import laplace, likely_starts
+from cfx_posteriors.neural import Learned, learn
 from cfx_posteriors.noise import RATE, SHAPE
 from cfx_posteriors.nuts import CHAINS, Chains, effective_samples, walk
 from cfx_posteriors.population import fit_population
@@ -51,6 +56,7 @@ MODELS: dict[str, DrivingModel] = {"krauss": Krauss(), "idm": IDM(), "w99": W99(
 DRIVERS = {"krauss": 1000, "idm": 300, "w99": 100}
 WALKERS, CHAIN = 40, 4000
 COVERED, REFERENCES, REFERENCE_DRAWS = 60, 2, 100
+BESIDE, IN_SUMO = 6, 2
 FRAMES, AFTER_S = 600, (1, 5, 10, 30)
 AHEAD_S = (1, 2, 3, 5, 10)
 AFTER = ", ".join(map(str, AFTER_S))
@@ -266,6 +272,112 @@ def covered(name: str) -> Iterator[str]:
         )
 
 
+def learned(name: str) -> Iterator[str]:
+    """Yields how often 90 % intervals of a network hold the truth, of synthetic drivers of 60 s."""
+    drawn = draw_recordings(MODELS[name], COVERED, frames=FRAMES, seed=12)
+    posterior, n = drawn.posterior, len(drawn.posterior.space)
+    started = time.process_time()
+    found = learn(posterior, SHARES, seed=0, memory=1 << 30)
+    spent = time.process_time() - started
+    normal = laplace(posterior, likely_starts(posterior, seed=0))
+    weighted = sample(posterior, normal, SHARES, seed=0, memory=1 << 30)
+    good = found.pareto_k <= RELIABLE
+    ends = [0, 9, 18]
+    off = (found.quantiles[:, ends] - weighted.quantiles[:, ends]).abs()
+    off = off / weighted.draws[..., :n].std(1)[:, None]
+    both = good & weighted.reliable
+    yield (
+        f"{type(MODELS[name]).__name__}: {COVERED} drivers, {spent:.0f} CPU s, k below 0.7"
+        f" {float(good.double().mean()):.0%} (weighted samples"
+        f" {float(weighted.reliable.double().mean()):.0%}), effective"
+        f" {float(found.effective.median()):.0f}, the network alone holds"
+        f" {float(found.coverage[0]):.0%} of simulated ones; apart from weighted samples where both"
+        f" settle {float(off[both].mean()):.2f} deviations, {float(off[both].max()):.2f} at most"
+    )
+    for label, quantiles in (("network", found.quantiles), ("weighted", weighted.quantiles)):
+        ranks = (drawn.truth[:, None, :n] > quantiles).sum(1)
+        held = ((ranks > 0) & (ranks < 19)).double()
+        counts = torch.stack([torch.histc(r.double(), CLASSES // 2, 0, 20) for r in ranks.T])
+        least = min(float(chisquare(one).pvalue) for one in counts.numpy())
+        yield (
+            f"{label}: held {float(held.mean()):.1%}, where the network's k is below 0.7"
+            f" {float(held[good].mean()):.1%}, else {float(held[~good].mean()):.1%}; each parameter"
+            f" {shares(held)}; ranks {' '.join(f'{c:.0f}' for c in counts.sum(0))}, least p"
+            f" {least:.3f}"
+        )
+
+
+def beside(name: str) -> Iterator[str]:
+    """Yields medians and 90 % intervals of I-80 drivers by weighted samples, network and chains."""
+    posterior = recorded(name, BESIDE)
+    space = posterior.space
+    spent = [time.process_time()]
+    normal = laplace(posterior, likely_starts(posterior, seed=0))
+    weighted = sample(posterior, normal, SHARES, seed=0, memory=1 << 30)
+    spent.append(time.process_time())
+    network = learn(posterior, SHARES, seed=0, memory=1 << 30)
+    spent.append(time.process_time())
+    mixed = walk(posterior, weighted, SHARES, seed=0, memory=1 << 30)
+    spent.append(time.process_time())
+    for driver in range(BESIDE):
+        rows = []
+        for number, parameter in enumerate(space.names):
+            said = []
+            for found in (weighted, network, mixed):
+                logits = found.quantiles[driver, [0, 9, 18]]
+                low, middle, high = space.from_unit(torch.sigmoid(logits))[:, number].tolist()
+                said.append(f"{middle:.3g} ({low:.3g} to {high:.3g})")
+            rows.append(f"{parameter} {', '.join(said)}")
+        yield f"driver {driver}, k {float(network.pareto_k[driver]):.2f}: {'; '.join(rows)}"
+    ways = {"laplace": weighted, "sbi": network}
+    for (label, found), first, last in zip(ways.items(), spent, spent[1:], strict=False):
+        off = apart(mixed, found.quantiles[:, [0, 9, 18]], len(space))
+        yield (
+            f"{label}: {last - first:.0f} CPU s; from chains {float(off.mean()):.2f} deviations"
+            f" apart in the mean, {float(off.max()):.2f} at most"
+        )
+    yield f"nuts: {spent[3] - spent[2]:.0f} CPU s, R-hat at most {float(mixed.r_hat.max()):.3f}"
+
+
+def sumo(name: str) -> Iterator[str]:
+    """Yields the posteriors of I-80 drivers with SUMO in the loop, beside those of equations."""
+    model = cast("DrivingModel", create("model", {"name": name}))
+    pairs = TidyDataset(path=I80, min_frames=700, max_pairs=IN_SUMO).load()
+    batch = PairBatch.of(pairs, dtype=torch.float64)
+    settings = CalibrationSettings(posterior="sbi")
+    simulator = cast("Simulator", create("simulator", {"name": "sumo", "workers": 1}))
+    simulated = simulator.stepper(model, batch.dt)
+    quantiles = {}
+    ways = (("laplace", MemoryStepper(model, batch.dt)), ("sbi", simulated), ("laplace", simulated))
+    for way, stepper in ways:
+        solver = Solver(stepper, RandomSearch(), seed=0)
+        posterior = posterior_of(solver, batch, batch.lengths - 1, settings)
+        began = time.perf_counter()
+        found: Learned | Sampled
+        if way == "sbi":
+            found = learn(posterior, SHARES, seed=0, memory=1 << 30)
+        else:
+            normal = laplace(posterior, likely_starts(posterior, seed=0))
+            found = sample(posterior, normal, SHARES, seed=0, memory=1 << 30)
+        label = f"{way}, {type(stepper).__name__}"
+        quantiles[label] = found.quantiles[:, [0, 9, 18]]
+        first = next(iter(quantiles.values()))
+        off = (quantiles[label] - first).abs() / (first[:, 2:] - first[:, :1])
+        k = ", ".join(f"{float(one):.2f}" for one in found.pareto_k)
+        yield (
+            f"{label}: {time.perf_counter() - began:.0f} s, k {k}; 5, 50, 95 % from the first"
+            f" {float(off.mean()):.2f} widths apart in the mean, {float(off.max()):.2f} at most"
+        )
+        values = model.space.from_unit(torch.sigmoid(quantiles[label]))
+        for driver, of_driver in enumerate(values):
+            rows = []
+            for number, parameter in enumerate(model.space.names):
+                low, middle, high = of_driver[:, number].tolist()
+                rows.append(f"{parameter} {middle:.3g} ({low:.3g} to {high:.3g})")
+            yield f"  driver {driver}: {', '.join(rows)}"
+    simulated.close()
+
+
 def reference(name: str) -> Iterator[str]:
     """Yields what the usual way takes: IDM and its noise in JAX, a driver at a time.
 
@@ -419,6 +531,9 @@ if __name__ == "__main__":
         "chains": chains,
         "nuts": nuts,
         "covered": covered,
+        "learned": learned,
+        "beside": beside,
+        "sumo": sumo,
         "reference": reference,
     }
     for line in programs[sys.argv[1]](sys.argv[2]):

@@ -56,8 +56,8 @@ def calibration_tables(
 ) -> dict[str, pd.DataFrame]:
     """Returns the tables of a calibration of driver-specific parameters.
 
-    There are none where nothing was calibrated per driver, nor where another program simulates
-    (`simulator=sumo`): it would take minutes.
+    There are none where nothing was calibrated per driver, nor, but for a posterior that was asked
+    for, where another program simulates (`simulator=sumo`): slices would take minutes.
 
     Returns:
         slices: see `cfx.calibration.identifiability.slices`.
@@ -69,13 +69,14 @@ def calibration_tables(
         Further ones with a posterior, see `DriverPosteriors.tables`.
     """
     calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
-    if not calibrated or not isinstance(context.simulator, MemoryStepper):
-        if settings.posterior != "none":
-            log.warning(
-                "calibration.posterior=%s has nothing to say: this job has calibrated no"
-                " driver-specific parameters",
-                settings.posterior,
-            )
+    elsewhere = not isinstance(context.simulator, MemoryStepper)
+    if not calibrated and settings.posterior != "none":
+        log.warning(
+            "calibration.posterior=%s has nothing to say: this job has calibrated no"
+            " driver-specific parameters",
+            settings.posterior,
+        )
+    if not calibrated or (elsewhere and settings.posterior == "none"):
         return {}
     number = {pair.pair_id: index for index, pair in enumerate(context.pairs)}
     ids = evaluation.about["pair_id"].drop_duplicates().astype(str).tolist()
@@ -98,8 +99,9 @@ def calibration_tables(
                 rows = rows.join(pd.DataFrame(known.columns(), index=ids), on="pair_id")
                 tables = known.tables(ids)
             fits.append(rows)
-    best = _parameters(evaluation, "fixed", ids, batch.leader_length)
-    tables["slices"] = slices(context.calibrator, batch, last, best, ids)
+    if not elsewhere:
+        best = _parameters(evaluation, "fixed", ids, batch.leader_length)
+        tables["slices"] = slices(context.calibrator, batch, last, best, ids)
     return {**tables, "fits": pd.concat(fits, ignore_index=True)}
 
 
@@ -276,11 +278,13 @@ def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
     config = complete(config, protocol)
     parts = Parts.of(config, protocol)
     if config.calibration.posterior != "none":
-        posterior_method(config.calibration.posterior)  # one that is not there is named at once
-        if not isinstance(parts.simulator, MemorySimulator):
+        # One that is not there is named at once.
+        method = posterior_method(config.calibration.posterior)
+        if not method.any_simulator and not isinstance(parts.simulator, MemorySimulator):
             raise ConfigError(
                 f"calibration.posterior={config.calibration.posterior} simulates each trajectory"
-                " thousands of times, which simulator=memory alone can; leave one of them out"
+                " thousands of times, which simulator=memory alone can; take"
+                " calibration.posterior=sbi, or leave one of them out"
             )
     return config, parts
 

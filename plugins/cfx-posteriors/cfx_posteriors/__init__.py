@@ -1,1 +1,1 @@
-"""What recordings say of drivers' parameters: `calibration.posterior=laplace|nuts|hierarchical`."""
+"""What recordings say of drivers' parameters: `calibration.posterior`, by name of a method."""

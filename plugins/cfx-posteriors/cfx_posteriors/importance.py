@@ -98,7 +98,7 @@ class Sampled(NamedTuple):
         return {"pareto_k": self.pareto_k}
 
 
-class _Components(NamedTuple):
+class Components(NamedTuple):
     """Student's t distributions.
 
     Attributes:
@@ -186,10 +186,10 @@ def _sampled(posterior: Posterior, normal: Normal, shares: Tensor, seed: int) ->
     for drivers, weighted, smoothed, k in _finished(posterior, normal, seed):
         weights = smoothed.exp()
         generator = torch.Generator().manual_seed(seed)
-        draws = _systematic(weighted.places, weights, DRAWS, generator)
+        draws = systematic(weighted.places, weights, DRAWS, generator)
         n = len(posterior.space)
-        quantiles = _quantiles(weighted.places[..., :n], weights, shares)
-        found.append((drivers, Sampled(quantiles, draws, _effective(smoothed), k)))
+        quantiles = weighted_quantiles(weighted.places[..., :n], weights, shares)
+        found.append((drivers, Sampled(quantiles, draws, effective_size(smoothed), k)))
     order = torch.cat([drivers for drivers, _ in found]).argsort()
     together = zip(*(part for _, part in found), strict=True)
     return _mended(
@@ -223,8 +223,8 @@ def _finished(
     samples = None
     for number in range(1, _MOST_ROUNDS + 1):
         samples = _further(posterior, samples, components, new, generator)
-        smoothed, k = _smoothed(samples.log_weights())
-        on = (k > _ENOUGH_K) | (_effective(smoothed) < _ENOUGH_SAMPLES)
+        smoothed, k = pareto_smoothed(samples.log_weights())
+        on = ~settled(smoothed, k)
         if number < _LEAST_ROUNDS:
             on[:] = True
         if number == _MOST_ROUNDS:
@@ -236,14 +236,14 @@ def _finished(
                 return
             left, posterior = left[on], posterior.take(on.nonzero()[:, 0])
             samples = _Weighted(*(values[on] for values in samples))
-            components = _Components(*(values[on] for values in components))
+            components = Components(*(values[on] for values in components))
             normal = Normal(*(values[on] for values in normal))
         new = _adapted(posterior, samples, normal, generator)
         together = zip(components, new, strict=True)
-        components = _Components(*(torch.cat(values, dim=1) for values in together))
+        components = Components(*(torch.cat(values, dim=1) for values in together))
 
 
-def _first(posterior: Posterior, normal: Normal) -> _Components:
+def _first(posterior: Posterior, normal: Normal) -> Components:
     """Returns Laplace's approximation, and the same with each parameter as wide as a priori."""
     n = len(posterior.space)
     deviation = torch.diagonal(normal.covariance, dim1=1, dim2=2).sqrt()
@@ -253,14 +253,14 @@ def _first(posterior: Posterior, normal: Normal) -> _Components:
     factor = torch.linalg.cholesky(normal.covariance)
     location = normal.mode[:, None].expand(-1, 2, -1)
     factors = torch.stack([factor, wider[..., None] * factor], dim=1)
-    return _Components(location, factors, torch.full_like(location[..., 0], 2.0))
+    return Components(location, factors, torch.full_like(location[..., 0], 2.0))
 
 
 def _further(
     posterior: Posterior,
     samples: _Weighted | None,
-    components: _Components,
-    new: _Components,
+    components: Components,
+    new: Components,
     generator: torch.Generator,
 ) -> _Weighted:
     """Returns samples with those of the new components, which are among all components."""
@@ -278,42 +278,42 @@ def _further(
 
 def _adapted(
     posterior: Posterior, samples: _Weighted, normal: Normal, generator: torch.Generator
-) -> _Components:
+) -> Components:
     """Returns a component like all samples, and some at single ones, by tempered weights."""
     logarithms = samples.log_weights()
-    weights = (_power(logarithms)[:, None] * logarithms).softmax(dim=1)
+    weights = (tempering_power(logarithms)[:, None] * logarithms).softmax(dim=1)
     location = (weights[..., None] * samples.places).sum(1, keepdim=True)
     away = samples.places - location
     covariance = _WIDER * ((weights[..., None] * away).mT @ away) + 1e-3 * normal.covariance
     factor = torch.linalg.cholesky(covariance)[:, None]
-    places = _systematic(samples.places, weights, _PLACES, generator)
+    places = systematic(samples.places, weights, _PLACES, generator)
     # Where the density hardly bends, the mode's curvature bounds the component.
     bent = curvature(posterior, places) + 1e-3 * torch.linalg.inv(normal.covariance)[:, None]
     upper = torch.linalg.cholesky(bent.flip(-2, -1)).flip(-2, -1)
     identity = torch.eye(places.shape[-1], dtype=places.dtype)
     lower = torch.linalg.solve_triangular(upper, identity, upper=True).mT
     share = torch.ones_like(places[..., 0])
-    return _Components(
+    return Components(
         torch.cat([location, places], dim=1),
         torch.cat([factor, math.sqrt(_WIDER) * lower], dim=1),
         torch.cat([torch.full_like(share[:, :1], _PLACES), share], dim=1),
     )
 
 
-def _power(log_weights: Tensor) -> Tensor:
+def tempering_power(log_weights: Tensor) -> Tensor:
     """Returns the largest power, at most 1, that leaves `_TEMPERED` effective samples, `(P,)`."""
     low, high = torch.zeros_like(log_weights[:, 0]), torch.ones_like(log_weights[:, 0])
-    enough = _effective(log_weights) >= _TEMPERED
+    enough = effective_size(log_weights) >= _TEMPERED
     if bool(enough.all()):
         return high
     for _ in range(_HALVINGS):
         middle = 0.5 * (low + high)
-        many = _effective((middle[:, None] * log_weights).log_softmax(dim=1)) >= _TEMPERED
+        many = effective_size((middle[:, None] * log_weights).log_softmax(dim=1)) >= _TEMPERED
         low, high = torch.where(many, middle, low), torch.where(many, high, middle)
     return torch.where(enough, 1.0, low)
 
 
-def _smoothed(log_weights: Tensor) -> tuple[Tensor, Tensor]:
+def pareto_smoothed(log_weights: Tensor) -> tuple[Tensor, Tensor]:
     """Returns Pareto-smoothed log weights `(P, N)` that sum to 1, and k `(P,)`."""
     with np.errstate(all="ignore"):  # where a few weights are all there is, k is not a number
         smoothed, k = array_stats.psislw(-log_weights.numpy())
@@ -321,12 +321,17 @@ def _smoothed(log_weights: Tensor) -> tuple[Tensor, Tensor]:
     return torch.log_softmax(torch.as_tensor(smoothed), dim=1), shape.reshape(len(log_weights))
 
 
-def _effective(log_weights: Tensor) -> Tensor:
+def settled(log_weights: Tensor, k: Tensor) -> Tensor:
+    """Returns which drivers' searches end, of log weights `(P, N)` and k `(P,)`, bool `(P,)`."""
+    return (k <= _ENOUGH_K) & (effective_size(log_weights) >= _ENOUGH_SAMPLES)
+
+
+def effective_size(log_weights: Tensor) -> Tensor:
     """Returns the effective sample size (Kish) of log weights `(P, N)`, `(P,)`."""
     return torch.exp(-torch.logsumexp(2.0 * log_weights, dim=1))
 
 
-def _quantiles(values: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
+def weighted_quantiles(values: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
     """Returns quantiles `(P, shares, n)` of values `(P, N, n)` with weights `(P, N)`."""
     ordered, order = values.sort(dim=1)
     below = weights[..., None].expand_as(values).gather(1, order).cumsum(dim=1).mT.contiguous()
@@ -335,7 +340,7 @@ def _quantiles(values: Tensor, weights: Tensor, shares: Tensor) -> Tensor:
     return ordered.gather(1, place.mT)
 
 
-def _systematic(places: Tensor, weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
+def systematic(places: Tensor, weights: Tensor, count: int, generator: torch.Generator) -> Tensor:
     """Returns equally weighted draws `(P, count, d)` in random order (systematic resampling)."""
     start = torch.rand(1, generator=generator, dtype=torch.float64)
     wanted = (torch.randperm(count, generator=generator) + start) / count

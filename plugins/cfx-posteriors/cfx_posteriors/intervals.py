@@ -5,6 +5,7 @@ Shapes: P drivers, n tuned parameters.
 
 from __future__ import annotations
 
+import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -19,6 +20,8 @@ from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.posterior import DriverPosteriors, PosteriorMethod
 from cfx.calibration.settings import LEVEL, CalibrationSettings
 from cfx.calibration.shards import Solver
+from cfx.core.errors import NotInstalledError
+from cfx.core.extras import install_line
 from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
 from cfx.simulation.trajectory import Segments
@@ -29,6 +32,7 @@ from cfx_posteriors.laplace import Normal, laplace, likely_starts
 from cfx_posteriors.population import Population, fit_population
 
 if TYPE_CHECKING:
+    from cfx_posteriors.neural import Learned
     from cfx_posteriors.nuts import Chains
 
 _SHARES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
@@ -149,7 +153,7 @@ class LaplaceMethod(PosteriorMethod):
         origin = PriorDrivers(solver.space, posterior.prior)
         normal = laplace(posterior, _starts(solver, posterior, best))
         found = self.draws_of(solver, posterior, _sampled(solver, posterior, normal))
-        return _intervals(solver, batch, last, settings, (posterior, normal, origin, found))
+        return _intervals(solver, batch, last, settings, (posterior, normal.mode, origin, found))
 
     def draws_of(self, solver: Solver, posterior: Posterior, sampled: Sampled) -> Sampled | Chains:
         """Returns the draws that stand for the posterior, of weighted samples of it."""
@@ -164,6 +168,41 @@ class NutsMethod(LaplaceMethod):
         from cfx_posteriors.nuts import walk
 
         return walk(posterior, sampled, _shares(), seed=solver.seed, memory=solver.memory)
+
+
+class SbiMethod(PosteriorMethod):
+    """Each driver alone, by a network that learns from simulations: whoever simulates.
+
+    Raises:
+        NotInstalledError: sbi is not installed.
+    """
+
+    any_simulator = True
+
+    def __init__(self) -> None:
+        if importlib.util.find_spec("sbi") is None:
+            raise NotInstalledError(
+                "calibration.posterior=sbi needs sbi, which is not installed; it comes with"
+                f" {install_line('cfx-posteriors[sbi]')}"
+            )
+
+    def find(
+        self,
+        solver: Solver,
+        batch: PairBatch,
+        last: Tensor,
+        best: Tensor,
+        settings: CalibrationSettings,
+    ) -> ParameterIntervals:
+        # sbi takes seconds to import.
+        from cfx_posteriors.neural import learn
+
+        posterior = posterior_of(solver, batch, last, settings)
+        origin = PriorDrivers(solver.space, posterior.prior)
+        found = learn(posterior, _shares(), seed=solver.seed, memory=solver.memory)
+        return _intervals(
+            solver, batch, last, settings, (posterior, found.likeliest, origin, found)
+        )
 
 
 class HierarchicalMethod(PosteriorMethod):
@@ -182,7 +221,9 @@ class HierarchicalMethod(PosteriorMethod):
         alone = posterior_of(solver, batch, last, settings)
         population, posterior, normal = fit_population(alone, _starts(solver, alone, best))
         sampled = _sampled(solver, posterior, normal)
-        return _intervals(solver, batch, last, settings, (posterior, normal, population, sampled))
+        return _intervals(
+            solver, batch, last, settings, (posterior, normal.mode, population, sampled)
+        )
 
 
 def _starts(solver: Solver, posterior: Posterior, best: Tensor) -> Tensor:
@@ -207,23 +248,23 @@ def _intervals(
     batch: PairBatch,
     last: Tensor,
     settings: CalibrationSettings,
-    found: tuple[Posterior, Normal, Population | PriorDrivers, Sampled | Chains],
+    found: tuple[Posterior, Tensor, Population | PriorDrivers, Sampled | Chains | Learned],
 ) -> ParameterIntervals:
     """Returns the intervals of each driver's parameters.
 
     Args:
         solver, batch, last, settings: as of `PosteriorMethod.find`.
-        found: the posteriors, Laplace's approximation of them, where new drivers come from, and
-            samples.
+        found: the posteriors, their likeliest coordinates `(P, d)`, where new drivers come from,
+            and samples.
     """
-    posterior, normal, origin, sampled = found
+    posterior, likeliest, origin, sampled = found
     space = solver.space
     shares = _shares()
     prior = posterior.prior.quantiles(shares, len(space))
     width = (sampled.quantiles[:, 2] - sampled.quantiles[:, 0]) / (prior[2] - prior[0])
     values = space.from_unit(torch.sigmoid(sampled.quantiles))
     low, median, high = values.unbind(1)
-    scale, correlation, left = _noise(posterior, normal)
+    scale, correlation, left = _noise(posterior, likeliest)
 
     def make_fan() -> Fan:
         whole = posterior_of(solver, batch, batch.lengths - 1, settings)
@@ -281,10 +322,10 @@ def posterior_of(
     )
 
 
-def _noise(posterior: Posterior, normal: Normal) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns scale, correlation and what is left of it at the mode, `(P,)` each."""
+def _noise(posterior: Posterior, likeliest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Returns scale, correlation and what is left of it at coordinates `(P, d)`, `(P,)` each."""
     n = len(posterior.space)
-    residual = posterior.residual(normal.mode[:, None])[..., 0]
+    residual = posterior.residual(likeliest[:, None])[..., 0]
     left = (residual[1:] * residual[:-1]).sum(0) / residual.square().sum(0).clamp(min=1e-300)
-    noise = normal.mode[:, n:]
+    noise = likeliest[:, n:]
     return noise[:, -1].exp(), noise[:, 0].tanh(), left

@@ -30,6 +30,8 @@ NAME = "posterior.nc"
 _PARAMETER = "parameter_"
 _DIAGNOSTICS = {
     "pareto_k": "above 0.7 a driver's draws are not to be relied on",
+    "expected_coverage": "share of simulated drivers' parameters that 90 % intervals of the network"
+    " hold",
     "r_hat": "above 1.05 a driver's chains differ",
     "divergences": "share of the draws; above 0.01 chains may have left out a part",
     "effective_samples": "effective sample size that the draws rest on",
@@ -55,7 +57,7 @@ class NetcdfExport(ExportFormat):
         if "posterior" not in tables or "fits" not in tables:
             raise DataError(
                 f"{run}: this job has found no posterior; run one with"
-                " calibration.posterior=laplace, nuts or hierarchical"
+                " calibration.posterior=laplace, nuts, sbi or hierarchical"
             )
         node = read_yaml(folder / "config.yaml")["model"]
         tree = inference_data(tables, cast(DrivingModel, create("model", node)))

@@ -39,7 +39,7 @@ class PriorDraws(ResultTable):
 
     meaning = (
         "parameters as likely as they are before a driver's recording is seen"
-        " (`calibration.posterior=laplace`, `nuts`)"
+        " (`calibration.posterior=laplace`, `nuts`, `sbi`)"
     )
     order = 213
     columns = (Column("parameter_NAME", "as of the parameter", "the parameter"),)
