@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -88,19 +89,17 @@ def test_without_sbi_it_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.slow
-def test_sumo_in_the_loop(tmp_path: object, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sumo_in_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The posterior of a model that SUMO drives is that of its equations."""
     pytest.importorskip("libsumo", reason="SUMO is not here; pip install 'cfx-driving[sumo]'")
-    monkeypatch.chdir(str(tmp_path))
-    monkeypatch.setattr(neural, "ROUNDS", 3)
+    monkeypatch.chdir(tmp_path)
+    for setting, value in {"FIRST": 100, "ROUNDS": 1, "EPOCHS": 1, "SIMULATIONS": 1}.items():
+        monkeypatch.setattr(neural, setting, value)
     asked = [*QUICK, "model=krauss_sumo", "data.pairs=2", "calibration.posterior=sbi"]
     found = {}
     for simulator in ("sumo", "memory"):
         cfx.run([*asked, f"simulator={simulator}", f"hydra.run.dir={simulator}"])
         fits = pd.read_parquet(f"{simulator}/fits.parquet")
         found[simulator] = fits[fits["method"] == "fixed"].set_index("pair_id")
-    columns = [name for name in found["memory"] if name.startswith(("low_", "median_", "high_"))]
-    assert columns
-    pd.testing.assert_frame_equal(
-        found["sumo"][columns], found["memory"][columns], rtol=0.1, atol=0.05
-    )
+    medians = [f"median_{name}" for name in ("tau", "accel", "decel", "minGap")]
+    pd.testing.assert_frame_equal(found["sumo"][medians], found["memory"][medians], rtol=0.1)
