@@ -15,20 +15,20 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from cfx.api.experiment import Experiment as Experiment
     from cfx.api.experiment import config as config
+    from cfx.api.experiment import evaluate as evaluate
     from cfx.api.experiment import from_config as from_config
+    from cfx.api.experiment import model as model
+    from cfx.api.experiment import train as train
     from cfx.api.fit import Fit as Fit
     from cfx.api.fit import calibrate as calibrate
     from cfx.api.forecasts import Forecast as Forecast
     from cfx.api.forecasts import forecast as forecast
-    from cfx.api.models import model as model
     from cfx.api.pairs import Pairs as Pairs
     from cfx.api.pairs import read as read
-    from cfx.api.policies import evaluate as evaluate
-    from cfx.api.policies import train as train
     from cfx.api.simulation import simulate as simulate
     from cfx.app.application import run as run
-    from cfx.app.job import JobResult as JobResult
-    from cfx.app.job import load as load
+    from cfx.app.job.results import JobResult as JobResult
+    from cfx.app.job.results import load as load
     from cfx.calibration.objectives import FrameValues as FrameValues
     from cfx.calibration.objectives import Objective as Objective
     from cfx.calibration.optimizers import CandidateLosses as CandidateLosses
@@ -79,18 +79,18 @@ _HOMES = {
     "calibrate": "cfx.api.fit",
     "Fit": "cfx.api.fit",
     "simulate": "cfx.api.simulation",
-    "train": "cfx.api.policies",
-    "evaluate": "cfx.api.policies",
+    "train": "cfx.api.experiment",
+    "evaluate": "cfx.api.experiment",
     "forecast": "cfx.api.forecasts",
     "Forecast": "cfx.api.forecasts",
-    "model": "cfx.api.models",
+    "model": "cfx.api.experiment",
     "config": "cfx.api.experiment",
     "from_config": "cfx.api.experiment",
     "Experiment": "cfx.api.experiment",
     "run": "cfx.app.application",
     "get": "cfx.core.registry",
-    "load": "cfx.app.job",
-    "JobResult": "cfx.app.job",
+    "load": "cfx.app.job.results",
+    "JobResult": "cfx.app.job.results",
     "Dataset": "cfx.data.base",
     "DatasetSettings": "cfx.data.base",
     "DrivingModel": "cfx.models.base",

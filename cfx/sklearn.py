@@ -15,9 +15,9 @@ from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
 from cfx.api.experiment import config
-from cfx.api.fit import prepared
 from cfx.api.pairs import Pairs, read
 from cfx.api.simulation import simulate
+from cfx.app.job import steps
 from cfx.calibration.identifiability import losses_of
 from cfx.core.errors import DataError
 from cfx.core.guest import visit
@@ -54,7 +54,8 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         >>> from cfx.sklearn import CarFollowingRegressor
         >>> from sklearn.model_selection import GridSearchCV, GroupKFold
         >>> table = cfx.read(dataset="synthetic", pairs=4, frames=120).frame
-        >>> regressor = CarFollowingRegressor(settings={"optimizer": "random"})
+        >>> settings = {"optimizer": "random", "optimizer.samples": 64}
+        >>> regressor = CarFollowingRegressor(settings=settings)
         >>> search = GridSearchCV(regressor, {"model": ["idm", "krauss"]}, cv=GroupKFold(2))
         >>> search.fit(table, groups=table["pair_id"]).best_params_["model"] in {"idm", "krauss"}
         True
@@ -146,7 +147,8 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         chosen = {"model": self.model, "objective": self.objective, "seed": self.seed}
         settings = {"policy": "fixed", "protocol": "within_driver", **(self.settings or {})}
         with visit():
-            context, _ = prepared(config(pairs, **settings, **chosen), pairs)
+            experiment = config(pairs, **settings, **chosen)
+            _, _, context = steps.without_files(experiment.config, pairs.selected)
         return context, Split.none(context.pairs, context.windows).frame
 
     def _pooled(self, pairs: Pairs) -> pd.Series:

@@ -7,14 +7,13 @@ import tomllib
 import pytest
 import yaml
 
-from cfx.app import cli
-from cfx.app.commands import cite
+from cfx.app import cli, nodes
 from tests.conftest import ROOT
 
 
 def test_cite_prints_bibtex_with_the_version(capsys: pytest.CaptureFixture[str]) -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]
-    entry = yaml.safe_load(cite.citation_file().read_text("utf-8"))
+    entry = yaml.safe_load(nodes.shipped("CITATION.cff").read_text("utf-8"))
     assert entry["version"] == project["version"]
     assert entry["license"] == project["license"]
     assert cli.main(["cite"]) == 0

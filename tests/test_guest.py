@@ -62,7 +62,7 @@ def refused_job() -> None:
 
 
 def loaded_job() -> None:
-    cfx.load(cfx.run([*QUICK, "policy=default"]).folder)
+    cfx.load("cfx://i80-idm")
 
 
 def nothing_loaded() -> None:

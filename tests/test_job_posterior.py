@@ -11,7 +11,7 @@ from rich.text import Text
 import cfx
 from cfx.core.errors import ConfigError, PluginError
 from cfx.models.krauss import Krauss
-from cfx.results.known import KnownParameters
+from cfx.results.tables import KnownParameters
 from tests.conftest import Installer
 
 QUICK = [

@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 from cfx.app.job.console import report, report_places
-from cfx.app.job.output import write_tables
+from cfx.app.job.results import tables_of
 from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
@@ -26,12 +26,12 @@ class Untracked:
         return ()
 
 
-def said(evaluation: Evaluation, *, width: int = 200) -> str:
+def said(evaluation: Evaluation, *, width: int = 200, folder: str = "folder") -> str:
     """Returns what a job prints."""
     out = io.StringIO()
     console = Console(file=out, width=width)
     report(findings(evaluation), evaluation.metrics(), (), console)
-    report_places(Path("folder"), console, cast(Any, Untracked()))
+    report_places(Path(folder), console, cast(Any, Untracked()))
     return out.getvalue()
 
 
@@ -46,6 +46,11 @@ def measured(hard_braking: dict[str, int], at_bounds: dict[str, float]) -> Evalu
     evaluation = make_results(pairs=4, frames=20).evaluation
     evaluation = with_metric(evaluation, "hard_braking", hard_braking, summary="sum")
     return with_metric(evaluation, "at_bounds", at_bounds)
+
+
+def test_an_odd_folder_is_printed_as_it_is() -> None:
+    nothing = measured({}, {})
+    assert said(nothing, folder="a job [z] \u00e4").endswith("Results: a job [z] \u00e4\n")
 
 
 def test_a_safe_drive_is_not_talked_about() -> None:
@@ -151,7 +156,7 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
         evaluation = dataclasses.replace(
             evaluation, platoon=make_platoon({"policy": 1}), tables={"history": history}
         )
-    written = write_tables(tmp_path, findings(evaluation))
+    written = tables_of(findings(evaluation), tmp_path)
     further = {one.file for one in written if not one.about.part.always}
     assert further == {"pair_metrics.parquet", *(names if present else ())}
     assert {path.name for path in tmp_path.iterdir()} == {one.file for one in written}

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from filelock import FileLock, SoftFileLease, Timeout
 
-from cfx.app.sweep import only_one
+from cfx.app.sweep.folder import only_one
 from cfx.calibration.cache import Cache
 from cfx.core import files
 from cfx.core.files import is_shared, lock_for

@@ -41,7 +41,7 @@ def test_entry_points_of_pyproject_are_the_installed_ones() -> None:
         installed = {
             (one.name, one.target)
             for one in registry.entries(kind.name)
-            if one.distribution == nodes.DISTRIBUTION
+            if one.distribution == registry.OWN
         }
         assert installed == declared.pop(kind.entry_points, set()), (
             "install again: pip install -e ."

@@ -35,7 +35,6 @@ FIGURES = {
     "cfx.figures.figure",
     "cfx.figures.job",
     "cfx.figures.text",
-    "cfx.figures.write",
 }
 RESULTS = {
     "cfx.core.console",

@@ -12,7 +12,7 @@ import pytest
 
 import cfx
 from cfx.app import cli
-from cfx.app.job.output import place_of
+from cfx.app.job.results import Upload, place_of
 from cfx.app.sweep.folder import fingerprint
 from cfx.calibration.cache import Cache
 from cfx.core import registry, storage
@@ -168,6 +168,14 @@ def job(folder: Path, url: str, *overrides: str) -> int:
     return cli.main([*JOB, f"hydra.run.dir={folder}", f"output.url={url}/jobs", *overrides])
 
 
+def copy_of_a_job(folder: Path, url: str, metrics: str) -> None:
+    """Copies a folder that holds what tells a job's."""
+    folder.mkdir(exist_ok=True)
+    for name, text in {"config.yaml": "{}", "metrics.json": metrics, ".lock": ""}.items():
+        (folder / name).write_text(text, encoding="utf-8")
+    Upload(f"{url}/jobs", folder).finish()
+
+
 def test_a_job_whose_folder_was_copied_is_read_from_its_url(
     bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -213,13 +221,14 @@ def test_what_an_earlier_job_left_at_a_url_goes_and_nothing_else(
 ) -> None:
     foreign, mine = RemoteFolder(f"{bucket}/jobs/data"), RemoteFolder(f"{bucket}/jobs/mine")
     foreign.write("pairs.parquet", b"recorded")
-    assert job(tmp_path / "data", bucket) == 0
+    copy_of_a_job(tmp_path / "data", bucket, "{}")
     assert foreign.read("pairs.parquet") == b"recorded"
-    assert job(tmp_path / "mine", bucket) == 0
+    copy_of_a_job(tmp_path / "mine", bucket, "{}")
     mine.write("platoon.parquet", b"of an earlier job")
-    assert job(tmp_path / "mine", bucket, "seed=1") == 0
+    copy_of_a_job(tmp_path / "mine", bucket, '{"rmse_speed/policy": 1.0}')
     assert mine.read("platoon.parquet") is None
     assert mine.read("metrics.json") == (tmp_path / "mine" / "metrics.json").read_bytes()
+    assert mine.read(".lock") is None
 
 
 def test_a_url_that_cannot_be_written_is_said_before_any_work(

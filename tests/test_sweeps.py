@@ -20,8 +20,10 @@ import pytest
 from filelock import FileLock
 from hydra.core.plugins import Plugins
 
-from cfx.app import application, hydra_source, sweep
+from cfx.app import application, hydra_source
 from cfx.app.sweep import SweepFolder
+from cfx.app.sweep.folder import RECORD, STATUS, fingerprint, only_one
+from cfx.app.sweep.summary import SUMMARY
 from cfx.results import provenance
 
 JOB = """
@@ -93,7 +95,7 @@ def ran() -> list[str]:
 
 
 def sweeps() -> list[Path]:
-    return sorted(path.parent for path in Path().rglob(sweep.RECORD))
+    return sorted(path.parent for path in Path().rglob(RECORD))
 
 
 def jobs(folder: Path) -> list[Path]:
@@ -105,7 +107,7 @@ def jobs(folder: Path) -> list[Path]:
 
 
 def summary(folder: Path) -> list[dict[str, str]]:
-    with (folder / sweep.SUMMARY).open(newline="") as file:
+    with (folder / SUMMARY).open(newline="") as file:
         return list(csv.DictReader(file))
 
 
@@ -213,7 +215,7 @@ def test_a_job_runs_again_if_its_data_changed_or_its_status_is_broken(run: Run) 
     assert runs() == 0
     Path("b.csv").write_text("ab")
     assert runs() == 1
-    (jobs(Path("s"))[0] / sweep.STATUS).write_text('{"code": 0')
+    (jobs(Path("s"))[0] / STATUS).write_text('{"code": 0')
     assert runs() == 1
     assert len(jobs(Path("s"))) == 1
 
@@ -229,16 +231,16 @@ def test_its_fingerprint_is_of_all_that_its_results_depend_on(
     for frames in ("100", "200"):
         monkeypatch.setenv("CFX_FRAMES", frames)
         values = hydra_source.plain(hydra_source.composed(job))
-        found.append(sweep.fingerprint(values))
-    assert sweep.fingerprint(values) == found[-1]
+        found.append(fingerprint(values))
+    assert fingerprint(values) == found[-1]
     Path("b.csv").write_text("ab")
-    found.append(sweep.fingerprint(values))
+    found.append(fingerprint(values))
     os.utime("a.csv", ns=(1, 1))
-    found.append(sweep.fingerprint(values))
+    found.append(fingerprint(values))
     monkeypatch.setattr(provenance, "version", lambda: "99.0")
-    found.append(sweep.fingerprint(values))
+    found.append(fingerprint(values))
     monkeypatch.setattr(provenance, "distributions", lambda values: {"cfx-idm": "0.3"})
-    found.append(sweep.fingerprint(values))
+    found.append(fingerprint(values))
     assert len(set(found)) == 6
 
 
@@ -292,7 +294,7 @@ def test_a_job_that_a_process_of_a_killed_sweep_still_runs_is_waited_for(tmp_pat
     thread = threading.Thread(target=other)
     thread.start()
     held.wait()
-    with sweep.only_one(tmp_path):
+    with only_one(tmp_path):
         order.append("mine")
     thread.join()
     assert order == ["other", "mine"]
@@ -496,7 +498,7 @@ def test_twelve_jobs_killed_half_way_end_as_twelve(
     finished = {
         job.name: (job / "metrics.json").stat().st_mtime_ns
         for job in jobs(folder)
-        if (job / sweep.STATUS).exists()
+        if (job / STATUS).exists()
     }
     assert 6 <= len(finished) < 12
 
@@ -511,7 +513,7 @@ def test_twelve_jobs_killed_half_way_end_as_twelve(
     assert statuses(folder) == ["FINISHED"] * 12
 
     # A job whose marker was lost after its run was closed runs again, and is there only once.
-    (jobs(folder)[0] / sweep.STATUS).unlink()
+    (jobs(folder)[0] / STATUS).unlink()
     assert continued([*command, f"hydra.sweep.dir={folder}"], tmp_path, processes) == 0
     assert statuses(folder) == ["FINISHED"] * 12
 
@@ -540,7 +542,7 @@ def statuses(folder: Path) -> list[str]:
     assert {Path(one.data.tags["cfx.folder"]).name for one in children} == {
         job.name for job in jobs(folder)
     }
-    assert json.loads((folder / sweep.RECORD).read_text())["completed"]
+    assert json.loads((folder / RECORD).read_text())["completed"]
     return [one.info.status for one in children]
 
 

@@ -18,7 +18,6 @@ from cfx.data.describe import describe
 from cfx.data.table import Column, Layout, read_table
 from cfx.data.tidy import frame_of, read_tidy
 from cfx.models.krauss import Krauss
-from tests.broken_plugins import QUICK
 from tests.drives import wavy_pairs
 from tests.scripts import ENVIRONMENT, command_of
 
@@ -37,14 +36,6 @@ def test_a_setting_that_another_option_has_is_said(capsys: pytest.CaptureFixture
     assert "data=ngsim" in said
     assert cli.main(["model.variant=vissim"]) == 2
     assert "model=idm has none; choose model=krauss, model=w99 too" in capsys.readouterr().err
-
-
-def test_an_odd_folder_is_printed_as_it_is(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    folder = tmp_path / "cfx job [z]"
-    assert cli.main([*QUICK, f"hydra.run.dir='{folder}'"]) == 0
-    assert f"Results: {folder}\n" in capsys.readouterr().out
 
 
 def test_the_advice_to_use_a_file_can_be_pasted(tmp_path: Path) -> None:

@@ -1,19 +1,32 @@
-"""The configuration of a call, composed as the command line composes it, and its command."""
+"""Jobs from Python: configurations as the command line composes them, policies, own models."""
 
 from __future__ import annotations
 
+import tempfile
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from cfx.api.pairs import Pairs, PairsLike, pairs_from
 from cfx.app.job.results import JobResult, read_config
 from cfx.app.job.run import compute
-from cfx.app.overrides import command_of, config_of
+from cfx.app.overrides import IN_MEMORY, command_of, config_of
+from cfx.core import registry
+from cfx.core.errors import ConfigError
 from cfx.core.guest import visit
+from cfx.models.base import DrivingModel
+from cfx.policies import checkpoint
+from cfx.policies.agent import Agent
 from cfx.results.config import JobConfig
 from cfx.results.tracker import folder_of
+
+PolicyLike = JobResult | Agent | str | Path
+"""A policy: a result that has one, the policy itself, a job's folder, or `cfx://NAME`."""
+
+M = TypeVar("M", bound=DrivingModel)
 
 
 @dataclass(frozen=True)
@@ -79,7 +92,8 @@ def config(pairs: PairsLike | None = None, /, **settings: Any) -> Experiment:
         if pairs is None:
             return Experiment(found)
         recording = pairs_from(pairs)
-        return Experiment(with_data(found, recording), recording)
+        node = {"data": dict(recording.node)}
+        return Experiment(JobConfig.of({**found.model_dump(), **node}), recording)
 
 
 def from_config(job: str | Path) -> Experiment:
@@ -97,6 +111,146 @@ def from_config(job: str | Path) -> Experiment:
     return Experiment(read_config(path))
 
 
-def with_data(config: JobConfig, pairs: Pairs) -> JobConfig:
-    """Returns a configuration whose dataset is that of pairs."""
-    return JobConfig.of({**config.model_dump(), "data": dict(pairs.node)})
+def train(
+    pairs: PairsLike,
+    model: str = "idm",
+    *,
+    for_: str = "unseen_drivers",
+    seed: int = 0,
+    **settings: Any,
+) -> JobResult:
+    """Trains a policy that adapts a model's parameters, as `experiment=FOR_ model=MODEL` does.
+
+    It takes minutes. The drivers are divided into folds, and each is tested by a network that
+    learned nothing from them. So the result says how well the policy drives unseen drivers; its
+    `policy` holds one more network, which learned from all, for others. Nothing is written:
+    `result.save("outputs/mine")` does, and `cfx.load` reads it back.
+
+    Args:
+        pairs: as `cfx.read` takes them.
+        model: as after `model=`.
+        for_: whom it is for, as after `experiment=`: `unseen_drivers`, `with_history`,
+            `stochastic` and so on.
+        seed: the same seed gives the same policy.
+        settings: others of the command line: `policy="lstm"`, `**{"learner.epochs": 20}`.
+
+    Raises:
+        CfxError: the pairs or a setting are wrong, in one sentence.
+
+    Examples:
+        >>> import cfx
+        >>> pairs = cfx.read(dataset="synthetic", pairs=4, frames=300)
+        >>> small = {"learner.epochs": 1, "learner.ensemble_size": 1, "protocol.folds": 2}
+        >>> small |= {"optimizer": "random", "optimizer.samples": 64}
+        >>> result = cfx.train(pairs, "idm", **small)
+        >>> sorted(result.pairs["method"].unique())
+        ['default', 'fixed', 'policy', 'population']
+        >>> result.improvement(over="population").index[0]
+        'mean'
+    """
+    return config(pairs_from(pairs), experiment=for_, model=model, seed=seed, **settings).run()
+
+
+def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings: Any) -> JobResult:
+    """Tests a policy on drivers that it has not learned from, as `protocol=transfer` does.
+
+    It is compared with the model's default parameters, with the pooled ones that it brings, and
+    with each driver's own, calibrated on the first part of their trajectory here.
+
+    Args:
+        policy: what `cfx.train` or `cfx.load` returned, a job's folder, or `cfx://NAME`.
+        pairs: as `cfx.read` takes them; pairs that the policy learned from are refused.
+        seed: of calibration and of intervals.
+        settings: others of the command line: `protocol="forecast"`, `optimizer="random"`.
+
+    Returns:
+        `pairs` has a row per pair and method; `improvement()` and `plot()` summarise them.
+
+    Raises:
+        CfxError: the policy has learned from these pairs or drives in other time steps, or a
+            setting is wrong.
+
+    Examples:
+        >>> import cfx
+        >>> pairs = cfx.read(dataset="synthetic", pairs=2, frames=300)
+        >>> result = cfx.evaluate("cfx://i80-idm", pairs, optimizer="random")
+        >>> result.pairs.shape[0]
+        8
+    """
+    with in_folder(policy) as folder:
+        chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
+        return config(pairs_from(pairs), **chosen).run()
+
+
+def settings_of(settings: Mapping[str, Any], folder: str) -> dict[str, Any]:
+    """Returns the settings of a call that tests the policy in a folder.
+
+    Raises:
+        ConfigError: one of them is the policy's own.
+    """
+    for key in settings:
+        if key.partition(".")[0] in {"model", "policy", "windows"}:
+            raise ConfigError(
+                f"{key}: the policy brings its model, its network and its windows; leave it out"
+            )
+    return {**settings, "protocol.run": folder}
+
+
+@contextmanager
+def in_folder(policy: PolicyLike) -> Iterator[str]:
+    """Gives the block the folder of a policy; one that is in memory alone is written for it.
+
+    Raises:
+        DataError: there is no such policy.
+    """
+    if isinstance(policy, JobResult) and policy.folder is not None:
+        policy = policy.folder
+    if isinstance(policy, str | Path):
+        folder_of(policy)  # says that it is not there
+        yield str(policy)
+        return
+    agent = policy.policy if isinstance(policy, JobResult) else policy
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary, IN_MEMORY)
+        checkpoint.save(agent, folder / "policy")
+        yield str(folder)
+
+
+def model(name: str) -> Callable[[type[M]], type[M]]:
+    """Makes a class a driving model that this process knows by a name, until it ends.
+
+    It then is a model like all others: `cfx.calibrate(pairs, "mine")`, `cfx.run(["model=mine"])`.
+    Defining it again replaces it. To share it, write a package: `cfx plugins new model mine`.
+
+    Args:
+        name: as after `model=`; not that of an installed model.
+
+    Raises:
+        PluginError: an installed model has that name, or the class does not say what a model says
+            (`cfx.DrivingModel`).
+
+    Examples:
+        >>> import cfx
+        >>> @cfx.model("constant_gap")
+        ... class ConstantGap(cfx.DrivingModel):
+        ...     "Approaches a gap that does not depend on speed."
+        ...     parameters = cfx.ParameterSpace.of(
+        ...         cfx.Parameter("s0", "m", 1.0, 50.0, 20.0, "gap"),
+        ...         cfx.Parameter("k", "1/s2", 0.01, 1.0, 0.1, "stiffness"),
+        ...     )
+        ...
+        ...     def next_speed(self, follower, leader, p, dt):
+        ...         gap = cfx.bumper_gap(follower, leader)
+        ...         approach = leader.speed - follower.speed
+        ...         acceleration = p["k"] * (gap - p["s0"]) + approach
+        ...         return (follower.speed + acceleration * dt).clamp(min=0.0)
+        >>> pairs = cfx.read(dataset="synthetic", pairs=2, frames=200)
+        >>> cfx.calibrate(pairs, "constant_gap", optimizer="random").parameters.columns.tolist()
+        ['s0', 'k']
+    """
+
+    def register(cls: type[M]) -> type[M]:
+        registry.add("model", name, cls)
+        return cls
+
+    return register

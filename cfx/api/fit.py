@@ -23,7 +23,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from torch import Tensor
 
-    from cfx.app.job.steps import Parts
     from cfx.calibration.posterior import DriverPosteriors
     from cfx.evaluation.protocols.base import ProtocolContext
 
@@ -78,8 +77,7 @@ class Fit:
     def defaults(self) -> pd.Series:
         """The model's default parameters, SI units."""
         space = self._context.space
-        values = [space[name].default for name in space.names]
-        return pd.Series(values, index=self.parameters.columns, name="default")
+        return pd.Series({name: space[name].default for name in space.names}, name="default")
 
     @cached_property
     def losses(self) -> pd.DataFrame:
@@ -90,11 +88,8 @@ class Fit:
         with `split=1` there is no rest.
         `method` is `default`, `population` (pooled) or `fixed` (driver-specific).
         """
-        tables = []
         with visit():
-            for method in METHODS:
-                tables.append(self._errors(method))
-        return pd.concat(tables, ignore_index=True)
+            return pd.concat([self._errors(method) for method in METHODS], ignore_index=True)
 
     def summary(self) -> pd.DataFrame:
         """Returns a row per parameter: its unit, default, pooled value, and the drivers' spread.
@@ -172,28 +167,18 @@ class Fit:
         if settings.posterior == "none":
             raise ConfigError(f"there is no posterior; {_ask_for('laplace')}")
         with visit():
-            return posterior_method(settings.posterior).find(
-                context.calibrator.solver,
-                context.batch,
-                self._last,
-                self._tensor("fixed"),
-                settings,
-            )
+            own, solver = self._tensor("fixed"), context.calibrator.solver
+            method = posterior_method(settings.posterior)
+            return method.find(solver, context.batch, self._last, own, settings)
 
     def plot(self) -> Figure:
         """Draws the parameters between their bounds, and how they go together."""
-        from cfx.figures.figure import ParameterAxis, Results
-        from cfx.figures.write import drawn
+        from cfx.figures.figure import Results, drawn, parameter_axes
 
-        tables = []
-        for method in METHODS:
-            table = self._of(method).add_prefix("parameter_")
-            tables.append(table.assign(method=method))
+        tables = [self._of(one).add_prefix("parameter_").assign(method=one) for one in METHODS]
         rows = pd.concat(tables, ignore_index=True)
-        axes = []
-        for one in self._context.space.tuned:
-            axes.append(ParameterAxis(one.name, one.unit, one.low, one.high, one.meaning))
-        return drawn("calibration", Results(rows, METHODS, tuple(axes)))
+        axes = parameter_axes(self._context.space.tuned)
+        return drawn("calibration", Results(rows, METHODS, axes))
 
     def _of(self, method: str) -> pd.DataFrame:
         """Returns a method's parameters, a row per pair."""
@@ -254,7 +239,7 @@ class Fit:
         )
 
     def _repr_html_(self) -> str:
-        from cfx.figures.write import as_html
+        from cfx.figures.figure import as_html
 
         return as_html(repr(self), self.summary())
 
@@ -303,25 +288,13 @@ def calibrate(
     recording = pairs_from(pairs)
     experiment = config(recording, policy="fixed", protocol="within_driver", **chosen)
     with visit():
-        context, parts = prepared(experiment, recording)
+        from cfx.app.job import steps
         from cfx.simulation.windows import Split
 
+        _, parts, context = steps.without_files(experiment.config, recording.selected)
         with closing(parts.engine):
             last = Split.of(context.pairs, context.windows, context.split).frame
             found = context.calibrator.fixed(context.pairs, context.batch, last)
     ids = pd.Index([pair.pair_id for pair in context.pairs], name="pair_id")
     table = pd.DataFrame(found.cpu().numpy(), ids, list(context.space.names))
     return Fit(experiment, recording, table, context, last)
-
-
-def prepared(experiment: Experiment, pairs: Pairs) -> tuple[ProtocolContext, Parts]:
-    """Returns what a protocol would work with, and the components; no cache is kept.
-
-    Raises:
-        CfxError: a setting is wrong.
-    """
-    from cfx.app.job import steps
-
-    config, parts = steps.prepare(experiment.config)
-    selected, style = steps.select_pairs(pairs.selected, config)
-    return steps.compose(steps.uncached(config), parts, selected, style), parts

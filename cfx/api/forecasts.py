@@ -12,10 +12,8 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 
-from cfx.api.experiment import config
-from cfx.api.fit import prepared
+from cfx.api.experiment import PolicyLike, config, in_folder, settings_of
 from cfx.api.pairs import PairsLike, pairs_from
-from cfx.api.policies import PolicyLike, in_folder, settings_of
 from cfx.core.errors import ConfigError
 from cfx.core.guest import visit
 
@@ -62,7 +60,7 @@ class Forecast:
             pair_ids: which; None: the first three.
         """
         from cfx.api.figures import draw_fans
-        from cfx.figures.write import for_notebooks
+        from cfx.figures.figure import for_notebooks
 
         chosen = list(self.paths["pair_id"].unique()[:3]) if pair_ids is None else list(pair_ids)
         return for_notebooks(draw_fans(chosen, self.quantiles(), self.measured))
@@ -72,7 +70,7 @@ class Forecast:
         return f"Forecast({pairs} pairs, {self.paths['path'].nunique()} paths each)"
 
     def _repr_html_(self) -> str:
-        from cfx.figures.write import as_html
+        from cfx.figures.figure import as_html
 
         return as_html(repr(self), self.quantiles())
 
@@ -120,10 +118,15 @@ def forecast(
     """
     import torch
 
+    from cfx.app.job import steps
+    from cfx.evaluation.closed_loop import Followers
+    from cfx.evaluation.forecasts import sample_from_origins
+
     with in_folder(policy) as folder, visit():
         recording = pairs_from(pairs)
         chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
-        context, parts = prepared(config(recording, **chosen), recording)
+        experiment = config(recording, **chosen)
+        _, parts, context = steps.without_files(experiment.config, recording.selected)
         finished = cast(Any, parts.protocol).finished
         finished.check(context.pairs)
         agent: Agent = finished.agent.to(context.batch.lengths.device)
@@ -133,26 +136,34 @@ def forecast(
                 " a stochastic one: cfx.train(pairs, for_='stochastic')"
             )
         origins = _origins(context, at)
-        steps = round(horizon / context.batch.dt) if math.isfinite(horizon) else 0
-        if steps < 1:
+        frames = round(horizon / context.batch.dt) if math.isfinite(horizon) else 0
+        if frames < 1:
             raise ConfigError(
                 f"horizon={horizon:g}: give one step of {context.batch.dt:g} s or more"
             )
-        generators: list[torch.Generator | None] = [None]
-        if samples:
-            generators = []
-            for number in range(samples):
-                generators.append(torch.Generator().manual_seed(seed * 1_000_003 + number))
-        found = _paths(context, agent, origins, steps, generators, leader)
+        generators: list[torch.Generator | None] = []
+        for number in range(samples):
+            generators.append(torch.Generator().manual_seed(seed * 1_000_003 + number))
+        base = None  # what the agent brings
+        if agent.base is not None and agent.context_rule.driver_specific:
+            calibrated = context.calibrator.fixed(context.pairs, context.batch, origins.frame.cpu())
+            base = agent.base_of(calibrated)[:, : calibrated.shape[1]]
+        network = torch.zeros_like(origins.pair)
+        followers = Followers(context.batch, network, base, agent.context_rule.history_s)
+        found = sample_from_origins(
+            context.simulator,
+            agent,
+            followers,
+            origins,
+            frames,
+            generators or [None],
+            leader=leader,
+        )
         return _tables(context, origins, found, known_to_the_end=leader != "given")
 
 
 def _origins(context: ProtocolContext, at: float) -> Origins:
-    """Returns the same moment of each pair.
-
-    Raises:
-        ConfigError: a pair does not last so long.
-    """
+    """Returns the same moment of each pair."""
     import torch
 
     from cfx.evaluation.forecasts import Origins
@@ -171,48 +182,12 @@ def _origins(context: ProtocolContext, at: float) -> Origins:
     return Origins(everyone, torch.full_like(everyone, frame))
 
 
-def _paths(
-    context: ProtocolContext,
-    agent: Agent,
-    origins: Origins,
-    steps: int,
-    generators: Sequence[torch.Generator | None],
-    leader: LeaderFuture,
-) -> Paths:
-    """Returns paths `(S, P, K + 1)`."""
-    import torch
-
-    from cfx.evaluation.closed_loop import Followers
-    from cfx.evaluation.forecasts import sample_from_origins
-
-    batch = context.batch
-    network = torch.zeros_like(origins.pair)
-    followers = Followers(
-        batch, network, _base(context, agent, origins), agent.context_rule.history_s
-    )
-    return sample_from_origins(
-        context.simulator, agent, followers, origins, steps, generators, leader=leader
-    )
-
-
-def _base(context: ProtocolContext, agent: Agent, origins: Origins) -> Tensor | None:
-    """Returns what each driver's policy starts from, `(P, n)`; None: what the agent brings."""
-    if agent.base is None or not agent.context_rule.driver_specific:
-        return None
-    history = context.calibrator.fixed(context.pairs, context.batch, origins.frame.cpu())
-    return agent.base_of(history)[:, : history.shape[1]]
-
-
 def _tables(
     context: ProtocolContext, origins: Origins, found: Paths, *, known_to_the_end: bool
 ) -> Forecast:
-    """Returns paths, and what happened, as tables.
+    """Returns paths `(S, P, K + 1)`, and what happened, as tables.
 
-    Args:
-        context: with the recording.
-        origins: one of each pair.
-        found: paths `(S, P, K + 1)`.
-        known_to_the_end: there is a leader beyond the end of a recording.
+    `known_to_the_end`: there is a leader beyond the end of a recording.
     """
     from cfx.evaluation.forecasts import measured_paths
 

@@ -130,7 +130,7 @@ class Pairs:
             pair_ids: which; None: the first three.
         """
         from cfx.api.figures import draw_pairs
-        from cfx.figures.write import for_notebooks
+        from cfx.figures.figure import for_notebooks
 
         chosen = self.selected[:3] if pair_ids is None else self.select(pair_ids).selected
         return for_notebooks(draw_pairs(list(chosen)))
@@ -156,7 +156,7 @@ class Pairs:
         return f"; left out: {', '.join(reasons)}" if reasons else ""
 
     def _repr_html_(self) -> str:
-        from cfx.figures.write import as_html
+        from cfx.figures.figure import as_html
 
         return as_html(repr(self), self.summary)
 

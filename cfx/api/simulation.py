@@ -14,12 +14,13 @@ import numpy as np
 import pandas as pd
 
 from cfx.api.fit import Fit
-from cfx.api.pairs import Pairs, PairsLike, pairs_from
+from cfx.api.pairs import PairsLike, pairs_from
 from cfx.app.overrides import config_of
 from cfx.core import registry
-from cfx.core.errors import ConfigError, DataError, listed, nearest
+from cfx.core.errors import ConfigError, DataError
 from cfx.core.guest import visit
 from cfx.data.pairs import Pair, PairBatch, PairSet
+from cfx.data.table import Column, Layout, table_of
 from cfx.data.tracks import accelerations, driven
 
 if TYPE_CHECKING:
@@ -33,6 +34,14 @@ _STANDSTILL_M, _TIME_GAP_S = 2.0, 1.5
 
 _FASTEST_MPS, _LONGEST_STEP_S = 100.0, 2.0
 """Beyond these a leader's speeds or times are in another unit."""
+
+_LEADER = Layout(
+    "a leader's speed over time",
+    (
+        Column("time_s", "s"),
+        Column("speed", "m/s", least=0.0, wrong="is no speed; give 0 or more, in m/s"),
+    ),
+)
 
 Parameters = Fit | Mapping[str, float] | pd.Series | pd.DataFrame | None
 """Parameters of followers: a fit's, one set for all, or a row for each."""
@@ -84,7 +93,9 @@ def simulate(
         15.0
     """
     with visit():
-        from cfx.models.base import DrivingModel
+        from cfx.models.base import DrivingModel, Leader
+        from cfx.simulation.rollout import simulate as rollout
+        from cfx.simulation.trajectory import Start
 
         if isinstance(parameters, Fit) and parameters.model != model:
             raise ConfigError(
@@ -108,8 +119,19 @@ def simulate(
                 f" {batch.dt:g} s; give a time within it"
             )
         given = _values(parameters, [pair.pair_id for pair in recording], made)
-        found = _simulated(made, given, batch, first)
-        return _table(recording, batch, found, first)
+        ahead = Leader(
+            batch.leader_position[:, first:],
+            batch.leader_speed[:, first:],
+            batch.leader_acceleration[:, first:],
+            batch.leader_length,
+        )
+        start = Start(
+            batch.follower_position[:, first],
+            batch.follower_speed[:, first],
+            batch.follower_acceleration[:, first],
+        )
+        found = rollout(made, given, ahead, start, batch.dt)
+        return _table(recording, found, start.acceleration, first)
 
 
 def _recording(
@@ -133,21 +155,21 @@ def _recording(
         return parameters.pairs.selected
     if pairs is None:
         raise ConfigError("give recorded pairs, or leader=FRAME with columns time_s and speed")
-    found: Pairs = pairs_from(pairs)
-    return found.selected
+    return pairs_from(pairs).selected
 
 
 def _behind(
     leader: pd.DataFrame | pd.Series, names: list[str], gap: float | None, speed: float | None
 ) -> PairSet:
     """Returns a pair for each name, behind one leader."""
-    time, speeds = _leader_columns(leader)
+    if isinstance(leader, pd.Series):
+        leader = leader.rename("speed").rename_axis("time_s").reset_index()
+    table = table_of(leader, _LEADER, "leader")
+    time, speeds = table.numbers["time_s"], table.numbers["speed"]
     steps = np.diff(time)
     dt = float(np.mean(steps)) if len(steps) else 0.0
     if len(time) < 2 or not np.allclose(steps, dt, rtol=0.05, atol=0) or dt <= 0:
         raise DataError("leader: time_s must advance by a constant step, over two rows or more")
-    if not (np.isfinite(speeds).all() and (speeds >= 0).all()):
-        raise DataError("leader: speed must be finite and 0 or more, in m/s")
     if dt > _LONGEST_STEP_S:
         raise DataError(f"leader: time_s advances by {dt:g} a row; give seconds, in steps of 0.1 s")
     if speeds.max() > _FASTEST_MPS:
@@ -158,66 +180,40 @@ def _behind(
     still = np.zeros(len(time))
     pairs = []
     for name in names:
-        pair = Pair(
-            pair_id=name,
-            recording="given",
-            leader_id="leader",
-            follower_id=name,
-            first_frame=0,
-            dt=dt,
-            leader_length=0.0,
-            leader_position=ahead + driven(speeds, dt),
-            leader_speed=speeds,
-            leader_acceleration=accelerations(speeds, dt),
-            follower_position=still,
-            follower_speed=still + start,
-            follower_acceleration=still,
+        pairs.append(
+            Pair(
+                pair_id=name,
+                recording="given",
+                leader_id="leader",
+                follower_id=name,
+                first_frame=0,
+                dt=dt,
+                leader_length=0.0,
+                leader_position=ahead + driven(speeds, dt),
+                leader_speed=speeds,
+                leader_acceleration=accelerations(speeds, dt),
+                follower_position=still,
+                follower_speed=still + start,
+                follower_acceleration=still,
+            )
         )
-        pairs.append(pair)
     return PairSet(tuple(pairs), "the given leader")
 
 
 def _at_least_0(name: str, value: Any, unit: str) -> float:
-    """Returns where a follower starts.
-
-    Raises:
-        ConfigError: the value is no such number.
-    """
+    """Returns a value of a follower's start."""
     number = float(value) if isinstance(value, Real) else math.nan
     if not (math.isfinite(number) and number >= 0):
         raise ConfigError(f"{name}={value!r}: give a number of 0 {unit} or more")
     return number
 
 
-def _leader_columns(leader: pd.DataFrame | pd.Series) -> tuple[Any, Any]:
-    """Returns a leader's times, s, and speeds, m/s."""
-    if isinstance(leader, pd.Series):
-        leader = leader.rename("speed").rename_axis("time_s").reset_index()
-    for name in ("time_s", "speed"):
-        if name not in leader:
-            columns = [str(one) for one in leader.columns]
-            raise DataError(
-                f"leader: column {name} is missing.{nearest(name, columns)} Columns found:"
-                f" {listed(columns, 20)}."
-            )
-    try:
-        return (leader["time_s"].to_numpy(np.float64), leader["speed"].to_numpy(np.float64))
-    except ValueError as error:
-        raise DataError(f"leader: time_s and speed must be numbers ({error})") from None
-
-
 def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict[str, Tensor]:
-    """Returns values `(P,)` by name.
-
-    Raises:
-        ConfigError: a parameter is unknown, or a follower has none.
-    """
+    """Returns values `(P,)` by name."""
     import torch
 
     if isinstance(parameters, Fit):
         parameters = parameters.parameters
-    if parameters is None:
-        parameters = {}
     if isinstance(parameters, pd.DataFrame):
         table = parameters.set_axis(parameters.index.astype(str))
         missing = [name for name in ids if name not in table.index]
@@ -228,7 +224,7 @@ def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict
             )
         table = table.loc[ids]
     else:
-        table = pd.DataFrame([dict(parameters)] * len(ids), ids)
+        table = pd.DataFrame([{} if parameters is None else dict(parameters)] * len(ids), ids)
     values = {}
     for name in table.columns.astype(str):
         model.space[name]  # says that it is unknown
@@ -239,47 +235,20 @@ def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict
     return values
 
 
-def _simulated(
-    model: DrivingModel, values: Mapping[str, Tensor], batch: PairBatch, first: int
-) -> Trajectory:
-    """Returns the followers from frame `first` on."""
-    from cfx.models.base import Leader
-    from cfx.simulation.rollout import simulate as rollout
-    from cfx.simulation.trajectory import Start
-
-    leader = Leader(
-        batch.leader_position[:, first:],
-        batch.leader_speed[:, first:],
-        batch.leader_acceleration[:, first:],
-        batch.leader_length,
-    )
-    start = Start(
-        batch.follower_position[:, first],
-        batch.follower_speed[:, first],
-        batch.follower_acceleration[:, first],
-    )
-    return rollout(model, dict(values), leader, start, batch.dt)
-
-
-def _table(pairs: PairSet, batch: PairBatch, found: Trajectory, first: int) -> pd.DataFrame:
-    """Returns a row per follower and frame."""
-    acceleration = batch.follower_acceleration[:, first:].clone()
-    acceleration[:, 1:] = (found.speed[:, 1:] - found.speed[:, :-1]) / batch.dt
+def _table(pairs: PairSet, found: Trajectory, at_start: Tensor, first: int) -> pd.DataFrame:
+    """Returns a row per follower and frame; `at_start` are the followers' first accelerations."""
     parts = []
     for number, pair in enumerate(pairs):
         count = len(pair) - first
-        signals = {
-            "position": found.position,
-            "speed": found.speed,
-            "acceleration": acceleration,
-            "gap": found.gap,
-        }
-        columns: dict[str, Any] = {
+        speed = found.speed[number, :count].numpy()
+        columns = {
             "pair_id": pair.pair_id,
             "time_s": (first + np.arange(count)) * pair.dt,
             "leader_speed": np.asarray(pair.leader_speed)[first:],
+            "position": found.position[number, :count].numpy(),
+            "speed": speed,
+            "acceleration": np.append(float(at_start[number]), np.diff(speed) / pair.dt),
+            "gap": found.gap[number, :count].numpy(),
         }
-        for name, values in signals.items():
-            columns[name] = values[number, :count].numpy()
         parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)

@@ -9,7 +9,6 @@ broken off goes on where it stopped: see `cfx.app.sweep`.
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import os
 import re
@@ -17,10 +16,10 @@ import sys
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeGuard
+from typing import TYPE_CHECKING, Any
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
@@ -29,19 +28,19 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from cfx.app import hydra_source, nodes
-from cfx.app.sweep import (
+from cfx.app.sweep import Refused, SweepFolder, worker_of
+from cfx.app.sweep.folder import (
     STATUS,
     JobStatus,
     Record,
-    Refused,
-    SweepFolder,
     fingerprint,
     metrics_of,
+    new_folder,
     only_one,
-    worker_of,
 )
-from cfx.app.user_errors import explain, is_user_error
+from cfx.app.user_errors import explain, explained, is_user_error
 from cfx.core import registry
+from cfx.core.console import console_logging
 from cfx.core.errors import (
     CfxError,
     ConfigError,
@@ -57,7 +56,7 @@ from cfx.core.processes import raise_if_terminated, signal_behind, terminable
 from cfx.core.storage import is_url
 
 if TYPE_CHECKING:
-    from cfx.app.job import JobResult
+    from cfx.app.job.results import JobResult
     from cfx.results.config import JobConfig
 
 log = logging.getLogger(__name__)
@@ -107,9 +106,7 @@ class JobFunction:
         metric, self.status = self._attempt(config, folder, blank, "")
         if self.status.code:
             # `start` prints the message of a single job, once.
-            text = "job failed: %s%s"
-            detail = _below(self.status.detail)
-            log.error(text, self.status.message, detail, extra={"file_only": True})
+            log.error("job failed: %s", _in_full(self.status), extra={"file_only": True})
         return metric
 
     def _run_in_sweep(self, config: DictConfig, folder: Path, blank: JobStatus) -> float:
@@ -125,22 +122,17 @@ class JobFunction:
             metric, self.status = self._attempt(config, folder, blank, sweep)
             self.status.write(folder)
         if self.status.code:
-            text = "job %d (%s) failed: %s%s"
             overrides = " ".join(blank.overrides)
-            detail = _below(self.status.detail)
-            log.error(text, blank.number, overrides, self.status.message, detail)
+            log.error("job %d (%s) failed: %s", blank.number, overrides, _in_full(self.status))
             return _value_of_failed(config, hydra_config.sweeper, self.status)
         return metric
 
     def _attempt(
         self, config: DictConfig, folder: Path, blank: JobStatus, sweep: str
     ) -> tuple[float, JobStatus]:
-        """Runs a job, or finds that it was done.
+        """Runs a job, of a multirun if `sweep` names one, or finds that it was done."""
+        from cfx.evaluation.headline import main_error
 
-        Args:
-            blank: what is known of its status.
-            sweep: the multirun's name, "" for a single job.
-        """
         began = time.monotonic()
         values: Any = {}
         try:
@@ -150,19 +142,18 @@ class JobFunction:
                     values["tracking"]["sweep"] = sweep
                 blank = replace(blank, fingerprint=fingerprint(values))
                 earlier = JobStatus.read(folder)
-                if _is_done(earlier, blank):
+                if earlier and earlier.code == 0 and earlier.fingerprint == blank.fingerprint:
                     log.info("job %d (%s) was done before", blank.number, " ".join(blank.overrides))
                     status = replace(blank, seconds=earlier.seconds, before=True)
-                    return _metric(metrics_of(folder)), status
+                    return main_error(metrics_of(folder)), status
                 (folder / STATUS).unlink(missing_ok=True)  # what it says is no longer so
-            with _blaming():
-                result = (self.run_job or _own_job())(_job_config(values), folder)
+            result = _run_job(values, folder, self.run_job)
         except (Exception, SystemExit) as error:
             status = self._failed(error, blank)
             if status.code == CfxError.exit_code:
                 status = replace(status, message=status.message + _preset_behind(status, values))
             return float("nan"), replace(status, seconds=time.monotonic() - began)
-        return _metric(result.metrics), replace(blank, seconds=time.monotonic() - began)
+        return main_error(result.metrics), replace(blank, seconds=time.monotonic() - began)
 
     def _failed(self, error: BaseException, blank: JobStatus) -> JobStatus:
         """Returns the status of a job that ended in an error; raises a signal that caused it."""
@@ -171,8 +162,7 @@ class JobFunction:
             raise signalled from None
         detail = traceback.format_exc().rstrip()
         if isinstance(error, CfxError | OmegaConfBaseException):
-            if not self.show_traceback:
-                detail = ""
+            detail = detail if self.show_traceback else ""
             return replace(blank, code=2, message=explain(error, ()), detail=detail)
         # A bug: its traceback is printed, and the other jobs go on.
         message = f"{type(error).__name__}: {error}"
@@ -183,9 +173,7 @@ class JobFunction:
 
 def start(arguments: Sequence[str], *, run_job: RunJob | None = None) -> int:
     """Runs the Hydra application and returns its exit code; prints each message once."""
-    _refuse_passwords(arguments)
-    _refuse_interpolated_folder()
-    _refuse_urls_as_folders(arguments)
+    _refuse(arguments)
     job = JobFunction(run_job, uuid.uuid4().hex, wants_traceback(arguments))
     SweepFolder.take()
     code = _run_hydra(job, arguments)
@@ -198,25 +186,13 @@ def start(arguments: Sequence[str], *, run_job: RunJob | None = None) -> int:
     return code
 
 
-def _refuse_passwords(arguments: Sequence[str]) -> None:
-    """Refuses a password in `tracking.uri`, before Hydra writes it into the job's folder.
+def _refuse(arguments: Sequence[str]) -> None:
+    """Refuses what Hydra would act upon before a job can.
 
     Raises:
-        ConfigError: there is one.
-    """
-    for argument in arguments:
-        key, _, value = argument.partition("=")
-        if key.lstrip("+") == "tracking.uri" and without_passwords(value) != value:
-            from cfx.results.config import SAYS_TOO_MUCH
-
-            raise ConfigError(f"tracking.uri={without_passwords(value)} {SAYS_TOO_MUCH}")
-
-
-def _refuse_interpolated_folder() -> None:
-    """Refuses a working directory whose name Hydra would take for an interpolation.
-
-    Raises:
-        ConfigError: it is such a one.
+        ConfigError: a password in `tracking.uri`, which Hydra writes into the job's folder; a URL
+            where Hydra would make a folder of that name; or a working directory whose name it would
+            take for an interpolation.
     """
     folder = str(Path.cwd())
     if "${" in folder:
@@ -224,28 +200,32 @@ def _refuse_interpolated_folder() -> None:
             f"the working directory {folder} holds '${{', which Hydra replaces in paths; start from"
             " another folder"
         )
-
-
-def _refuse_urls_as_folders(arguments: Sequence[str]) -> None:
-    """Refuses a URL where Hydra would make a folder of that name.
-
-    Raises:
-        ConfigError: there is one.
-    """
     for argument in arguments:
         key, _, value = argument.partition("=")
+        public = without_passwords(value)
+        if key.lstrip("+") == "tracking.uri" and public != value:
+            from cfx.results.config import SAYS_TOO_MUCH
+
+            raise ConfigError(f"tracking.uri={public} {SAYS_TOO_MUCH}")
         if key in {"hydra.run.dir", "hydra.sweep.dir"} and is_url(value.strip("'\"")):
             raise ConfigError(
-                f"{key} is a folder of this machine; output.url={without_passwords(value)} copies"
-                " jobs there when they are done"
+                f"{key} is a folder of this machine; output.url={public} copies jobs there when"
+                " they are done"
             )
 
 
 def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
     """Lets Hydra compose and call `job`; every way in which that ends becomes an exit code."""
     overrides = [one for one in arguments if not one.startswith("-")]
+    application = hydra.main(
+        config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
+    )
     try:
-        _call_hydra(job, arguments)
+        with guest(), terminable():
+            sys.argv = ["cfx", *arguments]
+            os.environ["HYDRA_FULL_ERROR"] = "1"
+            hydra_source.register()
+            application(job)()
     except SystemExit as error:
         # Hydra exits with 0 after --help and the like, with 1 or argparse's 2 after a message about
         # a wrong flag.
@@ -264,18 +244,6 @@ def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
     return 0
 
 
-def _call_hydra(job: JobFunction, arguments: Sequence[str]) -> None:
-    """Lets Hydra compose and call `job`."""
-    application = hydra.main(
-        config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
-    )
-    with guest(), terminable():
-        sys.argv = ["cfx", *arguments]
-        os.environ["HYDRA_FULL_ERROR"] = "1"
-        hydra_source.register()
-        application(job)()
-
-
 def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobResult:
     """Runs the job that `python -m cfx OVERRIDES` runs.
 
@@ -291,22 +259,15 @@ def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobR
     if isinstance(overrides, str):
         raise ConfigError(f"give a list of overrides: cfx.run({overrides.split()!r})")
     with visit():
-        return _compose_and_run(overrides, run_job)
-
-
-def _compose_and_run(overrides: Sequence[str], run_job: RunJob | None) -> JobResult:
-    """Does what `run` promises."""
-    try:
-        config = hydra_source.composed(overrides)
-        values = hydra_source.plain(config)
-        with hydra_source.resolving(config):
-            folder = _new_folder(Path(str(config.hydra.run.dir)).absolute())
-    except Exception as error:
-        if is_user_error(error) and not isinstance(error, CfxError):
-            raise ConfigError(explain(error, overrides)) from None
-        raise
-    with _log_file(folder / "cfx.log"), _blaming():
-        return (run_job or _own_job())(_job_config(values), folder)
+        with explained(overrides):
+            config = hydra_source.composed(overrides)
+            values = hydra_source.plain(config)
+            with hydra_source.resolving(config):
+                folder = new_folder(Path(str(config.hydra.run.dir)).absolute())
+        messages = logging.FileHandler(folder / "cfx.log", encoding="utf-8")
+        messages.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+        with console_logging(handler=messages):
+            return _run_job(values, folder, run_job)
 
 
 def wants_traceback(arguments: Sequence[str]) -> bool:
@@ -320,28 +281,18 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
     return False
 
 
-# What these import takes a tenth of a second and more, which `--help` does not wait for.
-def _job_config(values: Mapping[str, Any]) -> JobConfig:
-    from cfx.results.config import JobConfig
-
-    return JobConfig.of(values)
-
-
-def _own_job() -> RunJob:
-    from cfx.app.job.run import run_job
-
-    return run_job
-
-
-@contextlib.contextmanager
-def _blaming() -> Iterator[None]:
-    """Attributes what a plugin raises in the block to its distribution.
+def _run_job(values: Mapping[str, Any], folder: Path, run_job: RunJob | None) -> JobResult:
+    """Runs a job; what a plugin raises is attributed to its distribution.
 
     Raises:
-        CfxError: with the plugin's distribution, or because memory ran out.
+        CfxError: the user's mistake, with the plugin's distribution; or memory ran out.
     """
+    # Importing these takes a tenth of a second and more, which `--help` does not wait for.
+    from cfx.app.job.run import run_job as own_job
+    from cfx.results.config import JobConfig
+
     try:
-        yield
+        return (run_job or own_job)(JobConfig.of(values), folder)
     except CfxError:
         raise
     except (Exception, SystemExit) as error:  # a plugin may raise anything
@@ -360,46 +311,33 @@ def _blaming() -> Iterator[None]:
         raise blamed from error
 
 
-def _is_done(earlier: JobStatus | None, status: JobStatus) -> TypeGuard[JobStatus]:
-    """Says whether a job ended well before, with all that its results depend on as it is now."""
-    return earlier is not None and earlier.code == 0 and earlier.fingerprint == status.fingerprint
-
-
-def _below(detail: str) -> str:
-    """Returns a traceback so that it follows a message on a line of its own."""
-    if not detail:
-        return ""
-    return f"\n{detail}"
+def _in_full(status: JobStatus) -> str:
+    """Returns the message of a job that failed, its traceback below."""
+    return f"{status.message}\n{status.detail}".rstrip()
 
 
 def _interrupted(signalled: BaseException) -> int:
     """Says that a signal ended the program; returns its exit code."""
-    if isinstance(signalled, Terminated):
-        print("terminated; what was finished is kept", file=sys.stderr)
-        return TERMINATED
-    print("interrupted; what was finished is kept", file=sys.stderr)
-    return INTERRUPTED
-
-
-def _metric(metrics: Mapping[str, float]) -> float:
-    from cfx.evaluation.headline import main_error
-
-    return main_error(metrics)
+    terminated = isinstance(signalled, Terminated)
+    word = "terminated" if terminated else "interrupted"
+    print(f"{word}; what was finished is kept", file=sys.stderr)
+    return TERMINATED if terminated else INTERRUPTED
 
 
 def _preset_behind(status: JobStatus, values: Mapping[str, Any]) -> str:
     """Returns, to go after a message about a key, the preset that set it; "" if none did."""
     key = re.match(r"\w+(\.\w+)+", status.message)
-    if key is None:
+    if key is None or any(one.lstrip("+").startswith(f"{key[0]}=") for one in status.overrides):
         return ""
-    for override in status.overrides:
-        if override.lstrip("+").startswith(f"{key[0]}="):
-            return ""
-    choices = HydraConfig.get().runtime.choices
-    path = hydra_source.preset_behind(key[0], choices, values)
-    if path is None:
+    group = key[0].partition(".")[0]
+    choice, node = HydraConfig.get().runtime.choices.get(group), values.get(group)
+    if not isinstance(choice, str) or not isinstance(node, Mapping) or node.get("name") == choice:
         return ""
-    return f" It is set in {path}."
+    for folder in (nodes.conf_dir(), *hydra_source.plugin_conf_dirs().values()):
+        path = Path(folder) / group / f"{choice}.yaml"
+        if path.is_file():
+            return f" It is set in {path}."
+    return ""
 
 
 def _value_of_failed(config: DictConfig, sweeper: DictConfig, status: JobStatus) -> float:
@@ -435,43 +373,3 @@ def _report(error: BaseException | None, overrides: Sequence[str], show_tracebac
         return 1
     print(printable(without_passwords(explain(error, overrides))), file=sys.stderr)
     return 2
-
-
-def _new_folder(folder: Path) -> Path:
-    """Creates an output folder that did not exist before.
-
-    Raises:
-        ConfigError: it cannot be created.
-    """
-    candidate, number = folder, 1
-    while True:
-        try:
-            candidate.mkdir(parents=True)
-        except FileExistsError:
-            if not folder.is_dir():
-                raise ConfigError(
-                    f"{folder} is a file; choose another output folder with hydra.run.dir=FOLDER"
-                ) from None
-            number += 1
-            candidate = folder.with_name(f"{folder.name}-{number}")
-        except OSError as error:
-            raise ConfigError(explain(error, ())) from None
-        else:
-            return candidate
-
-
-@contextlib.contextmanager
-def _log_file(path: Path) -> Iterator[None]:
-    """Writes cfx's messages into a file."""
-    logger = logging.getLogger("cfx")
-    handler = logging.FileHandler(path, encoding="utf-8")
-    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-    level = logger.level
-    logger.addHandler(handler)
-    logger.setLevel(min(level or logging.INFO, logging.INFO))
-    try:
-        yield
-    finally:
-        logger.removeHandler(handler)
-        logger.setLevel(level)
-        handler.close()

@@ -34,7 +34,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv is None:
         argv = sys.argv[1:]
     arguments = list(argv)
-    _print_anything()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # letters that it does not know become `\xe4`
+            stream.reconfigure(errors="backslashreplace")
     try:
         with terminable():
             try:
@@ -106,16 +108,16 @@ def _command(name: str, *arguments: str) -> int:
 
 
 def _hydra(arguments: Sequence[str]) -> int:
-    """Runs the Hydra application, or completes what a shell asks for."""
+    """Runs the Hydra application; completes what a shell asks for (`-sc query=bash`)."""
+    from cfx.app import completion
 
     def start() -> int:
         from cfx.app import application
 
         return application.start(arguments)
 
-    from cfx.app import completion
-
-    if completion.is_query(arguments):
+    asks = len(arguments) == 2 and arguments[0] in {"-sc", "--shell-completion"}
+    if asks and arguments[1].startswith("query="):
         return completion.answer(start)
     return start()
 
@@ -135,10 +137,3 @@ def program() -> NoReturn:
     # Python looks for cycles in all libraries as it ends, which takes seconds.
     gc.freeze()
     sys.exit(code)
-
-
-def _print_anything() -> None:
-    r"""Lets terminals that know few letters print the others as `\xe4`, instead of failing."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")

@@ -12,26 +12,15 @@ import argparse
 import contextlib
 import io
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from cfx.core.command import Command
 
 
-def is_query(arguments: Sequence[str]) -> bool:
-    """Says whether a shell asks for words: `-sc query=bash`."""
-    if len(arguments) != 2 or arguments[0] not in {"-sc", "--shell-completion"}:
-        return False
-    return arguments[1].startswith("query=")
-
-
 def answer(hydra: Callable[[], int]) -> int:
-    """Prints the words with which the line may go on; returns the exit code.
-
-    Args:
-        hydra: prints Hydra's words for the line.
-    """
+    """Prints the words with which the line may go on, `hydra` Hydra's; returns the exit code."""
     from cfx.core import registry
 
     line = os.environ.get("COMP_LINE", "")
@@ -65,61 +54,36 @@ def answer(hydra: Callable[[], int]) -> int:
 
 
 def _words_of(command: str, line: str) -> list[str]:
-    """Returns the words of a sub-command; none where a plugin's is broken, whatever it prints."""
-    from cfx.core import registry
+    """Returns what the last word of a line behind a sub-command may become.
 
-    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
-        try:
-            made = cast("Command", registry.create("command", {"name": command}))
-            return words(made.parser(), line)
-        except Exception:  # a plugin may raise anything
-            return []
-
-
-def words(parser: argparse.ArgumentParser, line: str) -> list[str]:
-    """Returns what the last word of a line may become; nothing where it is a file.
-
-    Args:
-        parser: of the sub-command.
-        line: what was typed after the sub-command, the last word unfinished.
+    That is nothing where it is a file, or where the sub-command is a plugin's and broken.
     """
     from argcomplete.completers import SuppressCompleter
     from argcomplete.finders import CompletionFinder
 
-    nothing = SuppressCompleter()
-    finder = CompletionFinder(parser, always_complete_options=False, default_completer=nothing)
-    before = line[: len(line) - len(line.rpartition(" ")[2])]
+    from cfx.core import registry
+
     found: list[str] = []
-    while (whole := finder.rl_complete(line, len(found))) is not None:
-        found.append(whole.removeprefix(before).strip())
+    before = line[: len(line) - len(line.rpartition(" ")[2])]
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
+        try:
+            parser = cast("Command", registry.create("command", {"name": command})).parser()
+            finder = CompletionFinder(
+                parser, always_complete_options=False, default_completer=SuppressCompleter()
+            )
+            while (whole := finder.rl_complete(line, len(found))) is not None:
+                found.append(whole.removeprefix(before).strip())
+        except Exception:  # a plugin may raise anything
+            return []
     return found
 
 
 def complete_with(
     action: argparse.Action, answers: Callable[[argparse.Namespace], Iterable[str]]
 ) -> None:
-    """Lets an argument be completed with more than its choices.
-
-    Args:
-        action: what `add_argument` returned.
-        answers: gives the words, from the arguments that stand before.
-    """
+    """Lets an argument be completed with what the arguments that stand before it say."""
 
     def completer(parsed_args: argparse.Namespace, **_: object) -> list[str]:
         return list(answers(parsed_args))
 
     action.completer = completer  # type: ignore[attr-defined] # where argcomplete looks for it
-
-
-def kinds(_: argparse.Namespace) -> Iterable[str]:
-    """Returns the kinds of components."""
-    from cfx.core import registry
-
-    return registry.KINDS
-
-
-def names(options: argparse.Namespace) -> Iterable[str]:
-    """Returns the components of the kind that was named, from metadata alone."""
-    from cfx.core import registry
-
-    return registry.names(options.kind)

@@ -15,8 +15,8 @@ from __future__ import annotations
 import importlib.util
 import logging
 import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -39,9 +39,6 @@ if TYPE_CHECKING:
     from cfx.core.command import Command
 
 log = logging.getLogger(__name__)
-
-_MADE_BY_HYDRA = {"hydra/config.yaml", "hydra/launcher/basic.yaml", "hydra/sweeper/basic.yaml"}
-"""Options that Hydra has in code; a file of the same name on the search path replaces them."""
 
 
 class ComponentSource(ConfigSource):
@@ -92,8 +89,12 @@ class ComponentSearchPath(SearchPathPlugin):
     """Appends each plugin's `conf/` and then `cfx://` to Hydra's search path."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
+        # A file of such a name on the search path would replace Hydra's own.
+        in_code = {f"hydra/{one}.yaml" for one in ("config", "launcher/basic", "sweeper/basic")}
+        own = Path(hydra.__file__).parent / "conf"
         for package, folder in plugin_conf_dirs().items():
-            replaced = _replaced_of_hydra(folder)
+            names = {path.relative_to(folder).as_posix() for path in folder.rglob("*.yaml")}
+            replaced = [one for one in sorted(names) if one in in_code or (own / one).is_file()]
             if replaced:
                 log.warning(
                     "The plugin %s brings %s, which would replace Hydra's own; its folder %s is"
@@ -107,58 +108,21 @@ class ComponentSearchPath(SearchPathPlugin):
         search_path.append("cfx", "cfx://")
 
 
-def _replaced_of_hydra(folder: Path) -> list[str]:
-    """Returns the files in a plugin's `conf/` that Hydra has under the same name."""
-    own = Path(hydra.__file__).parent / "conf"
-    found = []
-    for path in sorted(folder.rglob("*.yaml")):
-        name = path.relative_to(folder)
-        if (own / name).is_file() or name.as_posix() in _MADE_BY_HYDRA:
-            found.append(name.as_posix())
-    return found
-
-
 def plugin_conf_dirs() -> dict[str, Path]:
     """Returns the `conf/` folder of every third party's top-level package that has one.
 
     Runs no code of theirs.
     """
-    packages = set()
-    for kind in registry.KINDS:
-        for entry in registry.entries(kind):
-            packages.add(entry.package)
+    packages = {entry.package for kind in registry.KINDS for entry in registry.entries(kind)}
     found: dict[str, Path] = {}
     for package in sorted(packages - {"cfx"}):
-        try:
+        with suppress(ImportError, ValueError):  # a broken distribution harms nobody else
             spec = importlib.util.find_spec(package)
-        except (ImportError, ValueError):  # a broken distribution harms nobody else
-            continue
-        if spec is None or spec.submodule_search_locations is None:
-            continue
-        for location in spec.submodule_search_locations:
-            folder = Path(location) / "conf"
-            if folder.is_dir():
-                found.setdefault(package, folder)
+            for location in (spec and spec.submodule_search_locations) or ():
+                folder = Path(location) / "conf"
+                if folder.is_dir():
+                    found.setdefault(package, folder)
     return found
-
-
-def preset_behind(key: str, choices: Mapping[str, str], values: Mapping[str, Any]) -> Path | None:
-    """Returns the file of the preset that may have set a key; None if no preset was chosen there.
-
-    Args:
-        key: such as "model.parameters.T".
-        choices: the option that was chosen of each group.
-        values: the job's configuration.
-    """
-    group = key.partition(".")[0]
-    choice, node = choices.get(group), values.get(group)
-    if not isinstance(choice, str) or not isinstance(node, Mapping) or node.get("name") == choice:
-        return None
-    for folder in (nodes.conf_dir(), *plugin_conf_dirs().values()):
-        path = Path(folder) / group / f"{choice}.yaml"
-        if path.is_file():
-            return path
-    return None
 
 
 def register() -> None:

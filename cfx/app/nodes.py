@@ -26,23 +26,20 @@ from cfx.core.component import Component
 from cfx.core.errors import CfxError
 from cfx.core.parameters import Parameter, ParameterSpace
 
-DISTRIBUTION = registry.OWN
-"""The distribution whose components have their nodes as files."""
-
 _WIDTH = 100
 """Longest line with a comment behind its value; a longer comment goes above."""
 
 
-def conf_dir() -> Path:
-    """Returns the folder of cfx's own config files.
-
-    It lies inside the package when installed, and beside it in a checkout.
-    """
+def shipped(name: str) -> Path:
+    """Returns what lies inside the package when installed, and beside it in a checkout."""
     package = Path(cfx.__file__).resolve().parent
-    inside = package / "conf"
-    if inside.is_dir():
-        return inside
-    return package.parent / "conf"
+    inside = package / name
+    return inside if inside.exists() else package.parent / name
+
+
+def conf_dir() -> Path:
+    """Returns the folder of cfx's own config files."""
+    return shipped("conf")
 
 
 def render(cls: type[Component], name: str) -> str:
@@ -51,14 +48,24 @@ def render(cls: type[Component], name: str) -> str:
     A setting that the user must give is null; `cfx.core.registry.create` then asks for it.
     """
     space = getattr(cls, "parameters", None)
-    lines = [*_comment(_summary(cls)), f"name: {_scalar(name)}"]
-    defaults = _defaults(cls.schema)
-    if isinstance(space, ParameterSpace):
-        defaults.pop("parameters", None)
-        lines += _settings(cls.schema, defaults)
-        lines += _parameters(space)
+    first = (inspect.getdoc(cls) or "").partition("\n\n")[0]
+    reference = str(getattr(cls, "reference", "") or "")
+    lines = [*_comment(f"{first}\n{reference}"), f"name: {_scalar(name)}"]
+    defaults: dict[str, Any] = {}
+    for setting, field in cls.schema.model_fields.items():
+        defaults[setting] = None
+        if not field.is_required():
+            defaults[setting] = field.get_default(call_default_factory=True, validated_data={})
+    if not isinstance(space, ParameterSpace):
+        return "\n".join([*lines, *_settings(cls.schema, defaults)]) + "\n"
+    defaults.pop("parameters", None)
+    lines += _settings(cls.schema, defaults)
+    if space.parameters:
+        lines.append("parameters:")
+        for parameter in space:
+            lines += _indented(_parameter(parameter))
     else:
-        lines += _settings(cls.schema, defaults)
+        lines.append("parameters: null  # required: {NAME: {low: , high: , default: }}")
     return "\n".join(lines) + "\n"
 
 
@@ -85,7 +92,7 @@ def built_in() -> list[registry.Entry]:
         if not about.chosen:
             continue
         for entry in registry.entries(kind):
-            if entry.distribution == DISTRIBUTION:
+            if entry.distribution == registry.OWN:
                 found.append(entry)
     return found
 
@@ -106,16 +113,6 @@ def write_all() -> int:
             path.write_text(text, encoding="utf-8")
             print(f"wrote {path}")
     return failed
-
-
-def _defaults(schema: type[BaseModel]) -> dict[str, Any]:
-    """Returns the settings' defaults; None for one that the user must give."""
-    values: dict[str, Any] = {}
-    for name, field in schema.model_fields.items():
-        values[name] = None
-        if not field.is_required():
-            values[name] = field.get_default(call_default_factory=True, validated_data={})
-    return values
 
 
 def _settings(schema: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
@@ -150,16 +147,6 @@ def _group(schema: type[BaseModel], name: str) -> str | None:
     return None
 
 
-def _parameters(space: ParameterSpace) -> list[str]:
-    """Returns the lines of a model's parameters."""
-    if not space.parameters:
-        return ["parameters: null  # required: {NAME: {low: , high: , default: }}"]
-    lines = ["parameters:"]
-    for parameter in space:
-        lines += _indented(_parameter(parameter))
-    return lines
-
-
 def _parameter(parameter: Parameter) -> list[str]:
     about = f"{parameter.name}, {parameter.unit}: {parameter.meaning}"
     if parameter.source:
@@ -192,20 +179,12 @@ def _line(name: str, value: str, note: str) -> list[str]:
 def _comment(text: str) -> list[str]:
     lines = []
     for paragraph in text.splitlines():
-        for part in textwrap.wrap(paragraph, _WIDTH - 2):
-            lines.append(f"# {part}")
+        lines += [f"# {part}" for part in textwrap.wrap(paragraph, _WIDTH - 2)]
     return lines
 
 
 def _indented(lines: list[str]) -> list[str]:
     return [f"  {line}" for line in lines]
-
-
-def _summary(cls: type[Component]) -> str:
-    """Returns the first paragraph of a class's docstring, and its reference."""
-    first = (inspect.getdoc(cls) or "").partition("\n\n")[0]
-    reference = str(getattr(cls, "reference", "") or "")
-    return "\n".join([first, reference]).strip("\n")
 
 
 def _value(value: Any) -> str:

@@ -9,43 +9,27 @@ from pathlib import Path
 from typing import Any
 
 from cfx.app import hydra_source
-from cfx.app.user_errors import explain, is_user_error
+from cfx.app.user_errors import explained
 from cfx.core import registry
-from cfx.core.errors import CfxError, ConfigError, DataError
+from cfx.core.errors import DataError
 from cfx.core.files import quoted
 from cfx.results.config import JobConfig
 
 
 def override(key: str, value: Any) -> str:
-    """Returns the override that gives a setting a value.
-
-    Args:
-        key: with its path: `data.min_frames`.
-        value: plain data: None, a truth value, a number, a text, a path, or lists and mappings of
-            these.
-    """
+    """Returns the override that gives a setting, such as `data.min_frames`, a plain value."""
     return f"{key}={_text(value)}"
 
 
 def config_of(settings: Mapping[str, Any]) -> JobConfig:
-    """Composes the configuration of settings, as the command line does.
-
-    Args:
-        settings: values by their keys; those that are None stay as they are.
+    """Composes a configuration as the command line does; settings that are None are usual.
 
     Raises:
         CfxError: a name or a value is wrong.
     """
-    overrides = []
-    for key, value in settings.items():
-        if value is not None:
-            overrides.append(override(key, value))
-    try:
+    overrides = [override(key, value) for key, value in settings.items() if value is not None]
+    with explained(overrides):
         values = hydra_source.plain(hydra_source.composed(overrides))
-    except Exception as error:
-        if is_user_error(error) and not isinstance(error, CfxError):
-            raise ConfigError(explain(error, overrides)) from None
-        raise
     return JobConfig.of(values)
 
 
@@ -119,7 +103,12 @@ def _differences(prefix: str, values: Mapping[str, Any], usual: Mapping[str, Any
 def _text(value: Any) -> str:
     """Returns a value in Hydra's grammar."""
     if isinstance(value, str | Path):
-        return _word(value)
+        text = str(value)
+        is_other = text.lower() in {"true", "false", "null"}  # which quotes make a text
+        with contextlib.suppress(ValueError):
+            float(text)
+            is_other = True
+        return quoted(text, always=is_other)
     if isinstance(value, Mapping):
         pairs = [f"{_text(key)}: {_text(item)}" for key, item in value.items()]
         return "{" + ", ".join(pairs) + "}"
@@ -128,12 +117,3 @@ def _text(value: Any) -> str:
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     return repr(value)
-
-
-def _word(text: str | Path) -> str:
-    """Returns a text in Hydra's grammar: in quotes where it would be a number or a truth value."""
-    is_other = str(text).lower() in {"true", "false", "null"}
-    with contextlib.suppress(ValueError):
-        float(str(text))
-        is_other = True
-    return quoted(str(text), always=is_other)

@@ -6,7 +6,7 @@ import contextlib
 import re
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, TypeGuard
+from typing import Any
 
 import yaml
 from hydra.core.override_parser.overrides_parser import OverridesParser
@@ -16,7 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cfx.app import hydra_source
 from cfx.core import registry
-from cfx.core.errors import CfxError, listed, nearest
+from cfx.core.errors import CfxError, ConfigError, listed, nearest
 from cfx.core.extras import advice
 
 
@@ -31,7 +31,25 @@ def is_user_error(error: BaseException) -> bool:
     # Hydra raises plain errors for contradictory flags and for options of the wrong type.
     if not isinstance(error, ValueError | AssertionError | RuntimeError | ImportError):
         return False
-    return _raised_in(error).startswith(("hydra.", "hydra_plugins.", "omegaconf."))
+    module = ""
+    for frame, _ in traceback.walk_tb(error.__traceback__):
+        module = str(frame.f_globals.get("__name__", ""))  # of the innermost frame in the end
+    return module.startswith(("hydra.", "hydra_plugins.", "omegaconf."))
+
+
+@contextlib.contextmanager
+def explained(overrides: Sequence[str]) -> Iterator[None]:
+    """Composes a configuration in the block.
+
+    Raises:
+        ConfigError: what Hydra says of the overrides, in one sentence.
+    """
+    try:
+        yield
+    except Exception as error:
+        if is_user_error(error) and not isinstance(error, CfxError):
+            raise ConfigError(explain(error, overrides)) from None
+        raise
 
 
 def explain(error: BaseException, overrides: Sequence[str]) -> str:
@@ -39,17 +57,19 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
     if isinstance(error, CfxError):
         return str(error)
     for cause in _chain(error):
-        if _is_about_a_file(cause):
+        if not isinstance(cause, OSError) or isinstance(cause, HydraException):
+            continue
+        if cause.filename and cause.strerror:
             return (
                 f"{cause.filename}: {cause.strerror}; choose an output folder that can be written"
                 " with hydra.run.dir=FOLDER (multiruns: hydra.sweep.dir=FOLDER)"
             )
-    if (
-        isinstance(error, MissingConfigException)
-        and error.missing_cfg_file
-        and error.options is not None
-    ):
-        return _unknown_option(error.missing_cfg_file, error.options)
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        if error.options is not None:
+            return (
+                f"{group}={name}: there is no {group} '{name}'.{advice(group, name, error.options)}"
+            )
     if isinstance(error, OverrideParseException):
         return _unreadable(error)
     return _reworded(error, overrides)
@@ -79,11 +99,6 @@ def _reworded(error: BaseException, overrides: Sequence[str]) -> str:
     return _plain(error)
 
 
-def _unknown_option(path: str, options: Sequence[str]) -> str:
-    group, _, name = path.rpartition("/")
-    return f"{group}={name}: there is no {group} '{name}'.{advice(group, name, options)}"
-
-
 def _unreadable(error: OverrideParseException) -> str:
     word = error.override
     if "=" not in word:
@@ -101,23 +116,24 @@ def _unreadable(error: OverrideParseException) -> str:
 
 def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     """Returns a sentence with the keys that there are where `key` was looked for."""
-    given = key
-    for override in overrides:
-        if re.match(rf"\+*{re.escape(key)}\b", override):
-            given = override
-            break
+    written = [one for one in overrides if re.match(rf"\+*{re.escape(key)}\b", one)]
+    given = written[0] if written else key
     others = [override for override in overrides if override != given]
     try:
         config: Any = hydra_source.composed(others)
     except Exception:  # the other overrides may be wrong too; the sentence is then without advice
         return f"{given}: there is no key '{key}'; cfx --cfg job prints every key"
-    inner, whole = _unknown_name(given, OmegaConf.select(config, key))
-    if inner:
-        sentence = _unknown_key(f"{key}.{inner}", others)
-        if whole and "Did you mean" not in sentence:
-            value = given.partition("=")[2]
-            sentence += f" To replace all of them: '~{key}' '+{key}={value}'"
-        return sentence
+    node = OmegaConf.select(config, key)
+    if isinstance(node, DictConfig):  # a name in the override's mapping may be wrong
+        value = OverridesParser.create().parse_override(given).value()
+        names = [str(name) for name in value] if isinstance(value, dict) else []
+        unknown = [name for name in names if name not in node]
+        if unknown:
+            sentence = _unknown_key(f"{key}.{unknown[0]}", others)
+            if len(unknown) == len(names) and "Did you mean" not in sentence:
+                value = given.partition("=")[2]
+                sentence += f" To replace all of them: '~{key}' '+{key}={value}'"
+            return sentence
     parent, _, last = key.rpartition(".")
     siblings = config
     if parent:
@@ -136,19 +152,6 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     everything: Any = OmegaConf.to_container(config, resolve=False)
     paths = _keys(everything)
     return f"{given}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
-
-
-def _unknown_name(override: str, node: object) -> tuple[str, bool]:
-    """Returns the first name of an override's mapping that a node lacks; whether it lacks all.
-
-    "" stands for no such name.
-    """
-    if not isinstance(node, DictConfig):
-        return "", False
-    value = OverridesParser.create().parse_override(override).value()
-    names = [str(name) for name in value] if isinstance(value, dict) else []
-    unknown = [name for name in names if name not in node]
-    return next(iter(unknown), ""), len(unknown) == len(names)
 
 
 def _options_with(group: str, setting: str, chosen: str) -> str:
@@ -180,17 +183,11 @@ def _plain(error: BaseException) -> str:
     noise = ("object_type=", "See https://", "Config search path", "provider=")
     parts: list[str] = []
     for cause in _chain(error):
-        kept = []
-        for line in str(cause).splitlines():
-            words = line.strip()
-            if words and not words.startswith(noise):
-                kept.append(words)
-        part = " ".join(kept)
+        lines = [line.strip() for line in str(cause).splitlines()]
+        part = " ".join(line for line in lines if line and not line.startswith(noise))
         if part and part not in parts:
             parts.append(part)
-    if not parts:
-        return f"{type(error).__name__} while composing the configuration"
-    return ": ".join(parts)
+    return ": ".join(parts) or f"{type(error).__name__} while composing the configuration"
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
@@ -198,19 +195,3 @@ def _chain(error: BaseException) -> Iterator[BaseException]:
     while current is not None:
         yield current
         current = current.__cause__
-
-
-def _is_about_a_file(error: BaseException) -> TypeGuard[OSError]:
-    return (
-        isinstance(error, OSError)
-        and not isinstance(error, HydraException)
-        and bool(error.filename and error.strerror)
-    )
-
-
-def _raised_in(error: BaseException) -> str:
-    """Returns the module of the innermost frame."""
-    module = ""
-    for frame, _ in traceback.walk_tb(error.__traceback__):
-        module = str(frame.f_globals.get("__name__", ""))
-    return module

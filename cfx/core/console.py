@@ -38,22 +38,24 @@ class ConsoleHandler(logging.Handler):
 
 
 @contextlib.contextmanager
-def console_logging(name: str = "cfx") -> Iterator[None]:
+def console_logging(name: str = "cfx", handler: logging.Handler | None = None) -> Iterator[None]:
     """Prints cfx's own messages while a sub-command runs; jobs have their logging from Hydra.
 
     Args:
         name: of the package or module whose messages are printed.
+        handler: takes them in place of the console, such as a file.
     """
     logger = logging.getLogger(name)
-    handler = ConsoleHandler()
+    handler = handler or ConsoleHandler()
     level = logger.level
     logger.addHandler(handler)
-    logger.setLevel(logging.INFO)
+    logger.setLevel(min(level or logging.INFO, logging.INFO))
     try:
         yield
     finally:
         logger.removeHandler(handler)
         logger.setLevel(level)
+        handler.close()
 
 
 def _say(message: str, level: int) -> None:

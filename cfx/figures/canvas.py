@@ -16,6 +16,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
@@ -24,6 +25,11 @@ from numpy.typing import ArrayLike, NDArray
 from cfx.figures.text import EDGE, INK, PALE, colour_of, label, percent
 
 Array = NDArray[np.float64]
+
+
+def vehicle_colour(vehicle: int, vehicles: int) -> str:
+    """Returns the colour of follower `vehicle` (1 and up) of `vehicles`, from dark to light."""
+    return to_hex(mpl.colormaps["viridis"](0.9 * (vehicle - 1) / max(vehicles - 1, 1)))
 
 
 def finite(values: Sequence[float] | Array) -> Array:
@@ -40,12 +46,6 @@ WIDTH = 10.5
 
 _FONT = 10.5
 """Points: the size of the text of axes on the usual paper."""
-
-_NARROW = 0.75
-"""Room below which panels stand one below the other."""
-
-_LINE = 120
-"""Characters that fit into the usual width."""
 
 
 @dataclass(frozen=True)
@@ -71,8 +71,7 @@ class Paper:
         return self.width / WIDTH / self.scale
 
 
-_USUAL = Paper()
-_PAPER: ContextVar[Paper] = ContextVar("paper", default=_USUAL)
+_PAPER: ContextVar[Paper] = ContextVar("paper", default=Paper())  # noqa: B039 - it is frozen
 
 Dash = Literal["solid"] | tuple[float, tuple[float, ...]]
 
@@ -98,9 +97,6 @@ HIDDEN = frozenset({"shrunk"})
 
 _HOVER: WeakKeyDictionary[Artist, str] = WeakKeyDictionary()
 """What the mouse shows over parts of figures."""
-
-_LEGEND_ROW = 5
-"""Methods that fit into one row of a legend."""
 
 _STYLE: dict[str, Any] = {
     "font.family": "DejaVu Sans",  # comes with matplotlib: the same figure on every machine
@@ -138,8 +134,6 @@ _STYLE: dict[str, Any] = {
     # A pair id may hold a dollar sign: it is text, never a formula.
     "text.parse_math": False,
 }
-_SIZES = ("size", "width", "pad")
-"""Endings of settings that are lengths in points."""
 
 
 @dataclass(frozen=True)
@@ -193,7 +187,7 @@ def wrapped(text: str) -> str:
     room = _PAPER.get().room
     if room >= 1:
         return text
-    return "\n".join(textwrap.wrap(text, max(20, round(_LINE * room))))
+    return "\n".join(textwrap.wrap(text, max(20, round(120 * room))))
 
 
 def side_by_side(figure: Figure, widths: Sequence[float], **more: Any) -> list[Axes]:
@@ -205,7 +199,7 @@ def side_by_side(figure: Figure, widths: Sequence[float], **more: Any) -> list[A
         more: as of `Figure.subplots`.
     """
     count = len(widths)
-    if count == 1 or _PAPER.get().room >= _NARROW:
+    if count == 1 or _PAPER.get().room >= 0.75:
         return list(figure.subplots(1, count, width_ratios=widths, squeeze=False, **more)[0])
     figure.set_figheight(count * figure.get_figheight())
     return list(figure.subplots(count, 1, squeeze=False, **more)[:, 0])
@@ -213,11 +207,8 @@ def side_by_side(figure: Figure, widths: Sequence[float], **more: Any) -> list[A
 
 def _style() -> dict[str, Any]:
     """Returns Matplotlib's settings for the paper: its sizes are those of `_STYLE`, scaled."""
-    scale = _PAPER.get().scale
-    if scale == 1:
-        return _STYLE
-    scaled = {key: _STYLE[key] * scale for key in _STYLE if key.endswith(_SIZES)}
-    return {**_STYLE, **scaled}
+    lengths = [key for key in _STYLE if key.endswith(("size", "width", "pad"))]  # in points
+    return {**_STYLE, **{key: points(_STYLE[key]) for key in lengths}}
 
 
 @contextmanager
@@ -248,11 +239,11 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     """Makes a function draw its figure in the common look."""
 
     @functools.wraps(draw)
-    def wrapped(*args: P.args, **kwargs: P.kwargs) -> Figure:
+    def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with figure_style():
             return draw(*args, **kwargs)
 
-    return wrapped
+    return drawn
 
 
 def canvas(height: float, width: float = WIDTH) -> Figure:
@@ -327,23 +318,15 @@ def method_handles(methods: Iterable[str]) -> list[Line2D]:
     """Returns legend entries."""
     handles = []
     for method in methods:
-        width = points(_WIDTHS.get(method, 1.6) + 0.4)
-        handles.append(
-            Line2D(
-                [],
-                [],
-                color=colour_of(method),
-                linestyle=DASHES.get(method, "solid"),
-                linewidth=width,
-                label=label(method),
-            )
-        )
+        handle = Line2D([], [], color=colour_of(method), linestyle=DASHES.get(method, "solid"))
+        handle.set(linewidth=points(_WIDTHS.get(method, 1.6) + 0.4), label=label(method))
+        handles.append(handle)
     return handles
 
 
 def method_legend(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
     """Puts a legend of methods above a figure, in one row; many take two."""
-    rows = -(-len(methods) // _LEGEND_ROW)
+    rows = -(-len(methods) // 5)
     columns = -(-len(methods) // rows)
     spacing = {"columnspacing": 1.4, "handlelength": 2.2, "title_fontsize": points(11)}
     legend_above(figure, method_handles(methods), columns, title=title, **spacing)

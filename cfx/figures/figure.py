@@ -1,4 +1,4 @@
-"""What a figure of a job is: what it shows of the results, how it is drawn, what is said of it.
+"""What a figure of a job is: what it shows of the results, how it is drawn and written.
 
 An entry point of the group `cfx.figures` makes it known; its name becomes that of the figure's
 files.
@@ -6,23 +6,28 @@ files.
 
 from __future__ import annotations
 
+import html
+import io
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import pandas as pd
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import DataError, listed, nearest
+from cfx.core.errors import DataError, OutputError, listed, nearest
 from cfx.core.extras import install_line
+from cfx.core.files import atomic_write
 from cfx.evaluation.result import Purpose
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from cfx.core.parameters import Parameter
     from cfx.data.style import StyleResult
     from cfx.evaluation.result import Evaluation, PairTrajectory
     from cfx.evaluation.statistics import Improvement
@@ -42,10 +47,10 @@ class ParameterAxis:
     meaning: str = ""
 
 
-def parameter_axes(evaluation: Evaluation) -> tuple[ParameterAxis, ...]:
-    """Returns the tuned parameters of an evaluation."""
+def parameter_axes(parameters: Iterable[Parameter]) -> tuple[ParameterAxis, ...]:
+    """Returns what figures show of a model's parameters."""
     axes = []
-    for one in evaluation.parameters:
+    for one in parameters:
         axes.append(ParameterAxis(one.name, one.unit, one.low, one.high, one.meaning))
     return tuple(axes)
 
@@ -86,13 +91,9 @@ class Results:
         tables: Mapping[str, pd.DataFrame] | None = None,
         metrics: Mapping[str, float] | None = None,
     ) -> Results:
-        """Returns the results of an evaluation and of the tables that a job has made.
+        """Returns the results of an evaluation; the rest as in the attributes.
 
-        Args:
-            evaluation: of the job.
-            style: as in the attributes.
-            tables: what the job has written, by name.
-            metrics: as in the attributes; None: those of the evaluation alone.
+        Without `metrics` they are those of the evaluation alone.
         """
         shown = evaluation.distinct_methods()
         improvements: Mapping[str, Improvement] = {}
@@ -101,7 +102,7 @@ class Results:
         return cls(
             pairs=shown.table,
             methods=shown.methods,
-            parameters=parameter_axes(evaluation),
+            parameters=parameter_axes(evaluation.parameters),
             trajectories=evaluation.trajectories,
             improvements=improvements,
             style=style,
@@ -169,3 +170,102 @@ def draw(one: registry.Installed[JobFigure], results: Results) -> Figure | None:
             return figure.draw(results)
 
     return one.attempt(attempt, None)
+
+
+METADATA: dict[str, dict[str, None]] = {
+    "png": {"Software": None},
+    "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
+    "svg": {"Creator": None, "Date": None},
+}
+"""What Matplotlib writes of itself and of today into each format, left out."""
+
+
+def write_figures(
+    folder: Path,
+    results: Results,
+    *,
+    formats: Sequence[str] = ("png",),
+    names: Sequence[str] | None = None,
+) -> list[Path]:
+    """Draws and writes all figures that the results allow; returns their paths.
+
+    Of all figures those are deleted that an earlier job has left in the folder.
+
+    Args:
+        formats: files of each figure: `png`, `pdf`, `svg`.
+        names: of the figures; None: all.
+
+    Raises:
+        OutputError: a file cannot be written.
+    """
+    paths = []
+    for one in registry.installed("figure"):
+        if names is not None and one.name not in names:
+            continue
+        figure = draw(one, results)
+        for form in ("png", "pdf", "svg"):
+            path = folder / f"{one.name}.{form}"
+            if figure is not None and form in formats:
+                paths.append(write_figure(figure, path))
+            elif names is None:
+                path.unlink(missing_ok=True)  # of an earlier job in the same folder
+    return paths
+
+
+def write_figure(figure: Figure, path: Path) -> Path:
+    """Writes one figure under its final name only once it is complete; returns the path.
+
+    The same figure gives the same bytes: no date and no version of Matplotlib is in it.
+
+    The ending of the path says the format.
+
+    Raises:
+        OutputError: the file cannot be written.
+    """
+    from cfx.figures.canvas import figure_style
+
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with atomic_write(path) as unfinished, figure_style():
+            form = path.suffix.removeprefix(".")
+            metadata: Any = METADATA[form]
+            figure.savefig(unfinished, format=form, metadata=metadata)
+    except OSError as error:
+        raise OutputError(
+            f"{path}: this figure cannot be written ({error.strerror or error});"
+            " free the path or choose another folder"
+        ) from error
+    return path
+
+
+def as_html(text: str, table: pd.DataFrame) -> str:
+    """Returns a line and the first ten rows of a table as HTML."""
+    shown = table.head(10).to_html(float_format=lambda value: f"{value:.3g}", border=0)
+    more = f"<p>{len(table) - 10} more rows</p>" if len(table) > 10 else ""
+    return f"<p>{html.escape(text)}</p>{shown}{more}"
+
+
+def for_notebooks(figure: Figure) -> Figure:
+    """Returns a figure that notebooks show by themselves; pyplot knows nothing of it."""
+    from cfx.figures.canvas import figure_style
+
+    def as_png() -> bytes:
+        stream = io.BytesIO()
+        with figure_style():
+            figure.savefig(stream, format="png")
+        return stream.getvalue()
+
+    vars(figure)["_repr_png_"] = as_png
+    return figure
+
+
+def drawn(name: str, results: Results) -> Figure:
+    """Return the figure of a name, in the common look, which notebooks show by themselves.
+
+    Raises:
+        DataError: there is no such figure, or the results have nothing of what it shows.
+    """
+    figure = draw(figure_named(name), results)
+    if figure is None:
+        raise DataError(f"the job has nothing of what the figure '{name}' shows")
+    return for_notebooks(figure)

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import cached_property
@@ -15,6 +16,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from pydantic import TypeAdapter, ValidationError
 
 from cfx.core.errors import DataError
 from cfx.core.job_folder import (
@@ -29,7 +31,7 @@ from cfx.core.job_folder import (
 )
 from cfx.data.style import StyleResult
 from cfx.evaluation.headline import improvement_key
-from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo, key_of
+from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo, column_of, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory, Purpose
 from cfx.evaluation.statistics import STATISTICS, Improvement
 from cfx.evaluation.tables import scope_label
@@ -76,14 +78,12 @@ class Job:
     name: str = ""
 
     def component(self, group: str) -> str:
-        """Returns the name of a component: of the group "model" for instance "w99".
+        """Returns the name of a component, of the group "model" for instance "w99".
 
         It is "" for the learner of a job that trains nothing, whatever its configuration says.
         """
         if group == "learner" and self.setting("protocol.run"):
             return ""
-        if group == "objective" and group not in self.config:
-            return "speed_rmse"  # a job of a version that had no other
         node = self.config.get(group)
         return str(node.get("name", "")) if isinstance(node, Mapping) else ""
 
@@ -104,10 +104,7 @@ class Job:
         """The methods that were compared, in the order in which they are shown."""
         present = self.pairs["method"].astype(str).unique().tolist()
         known = [method for method in METHODS if method in present]
-        for method in present:
-            if method not in known:
-                known.append(method)
-        return tuple(known)
+        return (*known, *(method for method in present if method not in METHODS))
 
     @property
     def meaningful_methods(self) -> tuple[str, ...]:
@@ -237,19 +234,20 @@ class Job:
         rows = self.pairs[self.pairs["method"] == "policy"]
         of_policy = rows.drop_duplicates("pair_id").set_index("pair_id")
         for baseline in self.methods:
-            column = improvement_column(baseline)
+            column = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
             if column in of_policy:
                 table[f"improvement/{baseline}"] = of_policy[column]
         return table.reset_index()
 
     @property
     def parameters(self) -> tuple[ParameterAxis, ...]:
-        """The tuned parameters of the trajectories, with what is known of them."""
-        if "trajectories" not in self.tables:
-            return ()
-        known = {axis.name: axis for axis in self.described_parameters}
-        names = _parameter_names(self.tables["trajectories"], self._simulated)
-        return tuple(known.get(name, ParameterAxis(name)) for name in names)
+        """The tuned parameters, as `data.json` describes them."""
+        axes = []
+        for about in self.data.get("parameters") or ():
+            low, high = _number(about.get("low")), _number(about.get("high"))
+            unit, meaning = str(about.get("unit", "")), str(about.get("meaning", ""))
+            axes.append(ParameterAxis(str(about.get("name")), unit, low, high, meaning))
+        return tuple(axes)
 
     @cached_property
     def results(self) -> Results:
@@ -257,7 +255,7 @@ class Job:
         return Results(
             pairs=self.pairs,
             methods=self.meaningful_methods,
-            parameters=self.parameters or self.described_parameters,
+            parameters=self.parameters,
             trajectories=self.pair_trajectories,
             improvements={one: self.statistics(one) for one in self.baselines()},
             style=self._style_result,
@@ -281,9 +279,7 @@ class Job:
     def _improved(self, baseline: str, scope: str) -> int:
         """Returns the number of pairs whose improvement over a baseline is defined."""
         nothing = pd.Series(dtype=float)
-        if scope == TEST:
-            return int(np.isfinite(self.by_pair.get(f"improvement/{baseline}", nothing)).sum())
-        column = f"{scope}_rmse_speed"
+        column = column_of("rmse_speed", scope)
         if column not in self.pairs:
             return 0
         speeds = self.pairs.pivot_table(
@@ -306,16 +302,6 @@ class Job:
         low, high = np.percentile(known, percentiles) if len(known) else (math.nan, math.nan)
         return StyleResult(table, {}, (float(low), float(high)))
 
-    @property
-    def described_parameters(self) -> tuple[ParameterAxis, ...]:
-        """The parameters of `data.json`, which stand there whatever else a job has written."""
-        axes = []
-        for about in self.data.get("parameters") or ():
-            low, high = _number(about.get("low")), _number(about.get("high"))
-            unit, meaning = str(about.get("unit", "")), str(about.get("meaning", ""))
-            axes.append(ParameterAxis(str(about.get("name")), unit, low, high, meaning))
-        return tuple(axes)
-
     @cached_property
     def pair_trajectories(self) -> tuple[PairTrajectory, ...]:
         """The test parts of all pairs; empty if the job left none."""
@@ -326,23 +312,16 @@ class Job:
             found.append(self._trajectory(str(pair_id), frames))
         return tuple(found)
 
-    @property
-    def _simulated(self) -> list[str]:
-        """The methods that the trajectories hold."""
-        table = self.tables.get("trajectories")
-        if table is None:
-            return []
-        return [method for method in self.methods if f"speed_{method}" in table]
-
     def _trajectory(self, pair_id: str, frames: pd.DataFrame) -> PairTrajectory:
         def column(name: str) -> np.ndarray:
             return frames[name].to_numpy(dtype=float)
 
-        speed, gap, parameters = {}, {}, {}
-        for method in self._simulated:
-            speed[method], gap[method] = column(f"speed_{method}"), column(f"gap_{method}")
-            columns = [f"{axis.name}_{method}" for axis in self.parameters]
-            parameters[method] = frames[columns].to_numpy(dtype=float)
+        methods = [method for method in self.methods if f"speed_{method}" in frames]
+        names = [axis.name for axis in self.parameters]
+        parameters = {}
+        for method in methods:
+            chosen = frames.reindex(columns=[f"{name}_{method}" for name in names])
+            parameters[method] = chosen.to_numpy(dtype=float)
         return PairTrajectory(
             pair_id=pair_id,
             driver="",
@@ -350,32 +329,17 @@ class Job:
             leader_speed=column("leader_speed"),
             real_speed=column("real_speed"),
             real_gap=column("real_gap"),
-            speed=speed,
-            gap=gap,
+            speed={method: column(f"speed_{method}") for method in methods},
+            gap={method: column(f"gap_{method}") for method in methods},
             parameters=parameters,
         )
 
 
-def improvement_column(baseline: str) -> str:
-    """Returns the column of `pairs.csv` with the improvement over a baseline."""
-    return "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
-
-
-def _parameter_names(trajectories: pd.DataFrame, methods: list[str]) -> list[str]:
-    """Returns what has a column for every method, besides speed and gap."""
-    names = []
-    suffix = f"_{methods[-1]}"
-    for column in trajectories:
-        name = str(column).removesuffix(suffix)
-        if not str(column).endswith(suffix) or name in {"speed", "gap"}:
-            continue
-        if all(f"{name}_{method}" in trajectories for method in methods):
-            names.append(name)
-    return names
-
-
 def _number(value: object) -> float | None:
     return float(value) if isinstance(value, int | float) else None
+
+
+_METRIC = TypeAdapter(MetricInfo)
 
 
 def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tuple[MetricInfo, ...]:
@@ -388,50 +352,28 @@ def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tupl
     listed = data.get("metrics")
     known = []
     for one in listed if isinstance(listed, list) else []:
-        if not isinstance(one, Mapping) or "name" not in one:
-            continue
-        metric = _metric_info(one)
-        scopes = []
-        for scope in metric.scopes:
-            if _is_measured(metric.name, scope, metrics):
-                scopes.append(scope)
-        if scopes:
-            known.append(replace(metric, scopes=tuple(scopes)))
+        with suppress(ValidationError):  # what is no metric is none
+            metric = _METRIC.validate_python(one)
+            scopes = []
+            for scope in metric.scopes:
+                if any(key.startswith(key_of(metric.name, "", scope)) for key in metrics):
+                    scopes.append(scope)
+            if scopes and metric.summary in SUMMARIES:
+                known.append(replace(metric, scopes=tuple(scopes)))
     return tuple(known)
 
 
-def _metric_info(values: Mapping[str, Any]) -> MetricInfo:
-    """Returns a metric as `data.json` describes it."""
-    scopes = values.get("scopes")
-    summary = str(values.get("summary", "mean"))
-    return MetricInfo(
-        name=str(values["name"]),
-        unit=str(values.get("unit", "")),
-        direction=str(values.get("direction", "none")),
-        summary=summary if summary in SUMMARIES else "mean",
-        heading=str(values.get("heading") or values["name"]),
-        meaning=str(values.get("meaning", "")),
-        scopes=tuple(map(str, scopes)) if isinstance(scopes, list) else (TEST,),
-        headline=bool(values.get("headline", True)),
-        distribution=str(values.get("distribution", "")),
-    )
-
-
-def _is_measured(name: str, scope: str, metrics: Mapping[str, float]) -> bool:
-    prefix = f"{name}/" if scope == TEST else f"{scope}/{name}/"
-    return any(key.startswith(prefix) for key in metrics)
-
-
-def read_job(folder: Path, origin: Origin) -> Job:
+def read_job(origin: Origin) -> Job:
     """Reads one finished job.
 
     Args:
-        folder: with `metrics.json`, `pairs.csv` and the other files of a job.
-        origin: what is known besides.
+        origin: its folder, and what is known besides.
 
     Raises:
         DataError: a file cannot be read, or is not what a job writes.
     """
+    folder = origin.folder
+    assert folder is not None
     examine(folder)
     config = read_yaml(folder / "config.yaml")
     data = optional(folder / "data.json", read_json) or {}
@@ -443,61 +385,37 @@ def read_job(folder: Path, origin: Origin) -> Job:
         raise DataError(f"{pairs} is damaged: it has no row of the method 'policy' or 'fixed'")
     missing = [one for one in installed() if one.part.always and one.name not in tables]
     hydra = folder if origin.hydra is None else origin.hydra
+    typed = optional(hydra / ".hydra" / "overrides.yaml", read_yaml_list)
     started, seconds = _duration(hydra, origin)
+    version, commit = str(origin.version or data.get("cfx") or ""), str(data.get("commit") or "")
+    if commit:  # of the folder that the job was started in
+        version = f"{version}, commit {commit}".removeprefix(", ")
     return Job(
         place=origin.place,
         config=public(config),
         data=public(data),
         metrics=read_metrics(folder / "metrics.json"),
         tables=tables,
-        overrides=_overrides(hydra),
+        overrides=None if typed is None else tuple(without_password(str(one)) for one in typed),
         experiment=str(config.get("preset") or ""),
         started=started,
         seconds=seconds,
-        version=_version(data, origin),
+        version=version,
         missing=tuple(file_of(one) for one in missing),
     )
-
-
-def _version(data: Mapping[str, Any], origin: Origin) -> str:
-    """Returns cfx's version and the commit of the folder that the job was started in."""
-    version = str(origin.version or data.get("cfx", "") or "")
-    commit = str(data.get("commit", "") or "")
-    if not commit:
-        return version
-    return f"{version}, commit {commit}".removeprefix(", ")
-
-
-def _overrides(folder: Path) -> tuple[str, ...] | None:
-    typed = optional(folder / ".hydra" / "overrides.yaml", read_yaml_list)
-    if typed is None:
-        return None
-    return tuple(without_password(str(one)) for one in typed)
 
 
 def _duration(folder: Path, origin: Origin) -> tuple[datetime | None, float | None]:
     """Returns when the job began, and how many seconds it took."""
     if origin.started is not None:
         return origin.started, origin.seconds
-    started, seconds = _times(folder / "cfx.log")
+    stamps = []
+    with suppress(OSError):
+        for line in (folder / "cfx.log").read_text(encoding="utf-8", errors="replace").splitlines():
+            with suppress(ValueError):  # each message begins with its time
+                stamps.append(datetime.strptime(line[:19], "%Y-%m-%d %H:%M:%S"))
+    seconds = (stamps[-1] - stamps[0]).total_seconds() if stamps else None
     status = optional(folder / "outcome.json", read_json) or {}
     if isinstance(status.get("seconds"), int | float):
         seconds = float(status["seconds"])
-    return started, seconds
-
-
-def _times(log: Path) -> tuple[datetime | None, float | None]:
-    """Returns when a log begins and how long it is; each line begins with its time."""
-    try:
-        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    except OSError:
-        return None, None
-    stamps = []
-    for line in lines:
-        try:
-            stamps.append(datetime.strptime(line[:19], "%Y-%m-%d %H:%M:%S"))
-        except ValueError:
-            continue
-    if not stamps:
-        return None, None
-    return stamps[0], (stamps[-1] - stamps[0]).total_seconds()
+    return stamps[0] if stamps else None, seconds

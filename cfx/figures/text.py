@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import os
+import re
 from typing import NamedTuple
 
 from cfx.evaluation.metrics.base import SCOPES
@@ -117,9 +119,7 @@ def percent(fraction: float, digits: int = 0) -> str:
 
 def percent_or_undefined(fraction: float, digits: int = 0) -> str:
     """Returns a signed percentage, or "undefined" where it is not finite."""
-    if not math.isfinite(fraction):
-        return "undefined"
-    return percent(fraction, digits)
+    return percent(fraction, digits) if math.isfinite(fraction) else "undefined"
 
 
 def number(value: float) -> str:
@@ -157,15 +157,7 @@ def common_prefix(names: list[str]) -> str:
     """Returns what all names start with, up to a separator: "i80-" of "i80-11-1" and "i80-12-7"."""
     if len(names) < 2:
         return ""
-    # The first and the last in alphabetical order differ earliest.
-    first, last = min(names), max(names)
-    same = 0
-    while same < min(len(first), len(last)) and first[same] == last[same]:
-        same += 1
-    end = 0
-    for separator in "_-/:.":
-        end = max(end, first.rfind(separator, 0, same) + 1)
-    return first[:end]
+    return re.sub(r"[^_\-/:.]*$", "", os.path.commonprefix(names))  # noqa: RUF071 - they are no paths
 
 
 def unit_label(name: str, unit: str) -> str:
@@ -175,14 +167,8 @@ def unit_label(name: str, unit: str) -> str:
 
 def pretty_unit(unit: str) -> str:
     """Returns a unit with raised digits: "m/s2" -> "m/s²"."""
-    for plain, raised in (
-        ("1e-4", "10⁻⁴"),
-        ("m/s2", "m/s²"),
-        ("m2/s2", "m²/s²"),
-        ("m/s3", "m/s³"),
-    ):
-        unit = unit.replace(plain, raised)
-    return unit
+    unit = unit.replace("1e-4", "10⁻⁴")
+    return re.sub(r"(?<=[ms])[234]", lambda found: "²³⁴"["234".index(found[0])], unit)
 
 
 COLOURS = {
@@ -227,27 +213,7 @@ JOB_COLOURS = (
 )
 """Tol's muted colours, told apart by readers with any colour vision, none a method's."""
 
-_VEHICLES = (
-    "#440154",
-    "#482576",
-    "#404588",
-    "#34618d",
-    "#297a8e",
-    "#20928c",
-    "#25ac82",
-    "#4cc26c",
-    "#86d549",
-    "#cae11f",
-)
-"""The colour map viridis from dark to light."""
-
 
 def colour_of(method: str) -> str:
     """Returns the colour of a method or of a recorded vehicle."""
     return COLOURS.get(method, OTHER_COLOUR)
-
-
-def vehicle_colour(vehicle: int, vehicles: int) -> str:
-    """Returns the colour of follower `vehicle` (1 and up) of `vehicles`, from dark to light."""
-    place = (vehicle - 1) * (len(_VEHICLES) - 1) / max(vehicles - 1, 1)
-    return _VEHICLES[round(place)]

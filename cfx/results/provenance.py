@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import getpass
 import importlib.metadata
-import os
 import socket
 import subprocess
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import psutil  # type: ignore[import-untyped]  # it ships no types
-
-_GIT_SECONDS = 10.0
 
 
 def version() -> str:
@@ -31,55 +29,38 @@ def git_state(folder: Path) -> dict[str, str]:
     if not commit:
         return {}
     changed = _git(folder, "status", "--porcelain", "--untracked-files=no")
-    dirty = "unknown"
-    if changed is not None:
-        dirty = str(bool(changed)).lower()
+    dirty = "unknown" if changed is None else str(bool(changed)).lower()
     return {"cfx.git_commit": commit, "cfx.git_dirty": dirty, "mlflow.source.git.commit": commit}
 
 
 def commit(folder: Path) -> str:
-    """Returns the commit of the git checkout around `folder`, `+` behind it if files have changed.
-
-    It is "" where there is no checkout.
-    """
+    """Returns the commit around `folder`, `+` behind it if files have changed; "" for none."""
     state = git_state(folder)
-    changed = ""
-    if state.get("cfx.git_dirty") == "true":
-        changed = "+"
+    changed = "+" if state.get("cfx.git_dirty") == "true" else ""
     return state.get("cfx.git_commit", "")[:12] + changed
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
     command = ["git", "-C", str(folder), *arguments]
     try:
-        # `git` is the user's own, found on their PATH; no shell sees the arguments.
         done = subprocess.run(  # noqa: S603 - git, found on the user's own PATH; no shell
-            command, capture_output=True, text=True, timeout=_GIT_SECONDS, check=False
+            command, capture_output=True, text=True, timeout=10.0, check=False
         )
     except (OSError, subprocess.TimeoutExpired):
         return None
-    if done.returncode != 0:
-        return None
-    return done.stdout.strip()
+    return done.stdout.strip() if done.returncode == 0 else None
 
 
 def plugin_tags(distributions: Mapping[str, str]) -> dict[str, str]:
     """Returns a tag per plugin distribution, and one of them all, by which runs can be grouped."""
-    tags = {}
-    listed = []
-    for name, found in sorted(distributions.items()):
-        tags[f"cfx.plugin.{name}"] = found
-        listed.append(f"{name} {found}")
-    return {"cfx.plugins": ", ".join(listed) or "none", **tags}
+    found = dict(sorted(distributions.items()))
+    listed = ", ".join(f"{name} {version}" for name, version in found.items())
+    tags = {f"cfx.plugin.{name}": version for name, version in found.items()}
+    return {"cfx.plugins": listed or "none", **tags}
 
 
 def distributions(values: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the plugin distributions of the chosen components, and their versions.
-
-    cfx's own distribution is no plugin.
-
-    Args:
-        values: a job's configuration.
+    """Returns the plugin distributions of a configuration's components, and their versions.
 
     Raises:
         PluginError: there is no component of that name.
@@ -97,10 +78,7 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def metric_distributions(values: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the plugin distributions of the metrics that a job measures, and their versions.
-
-    Args:
-        values: a job's configuration.
+    """Returns the plugin distributions of a configuration's metrics, and their versions.
 
     Raises:
         PluginError: there is no metric of that name.
@@ -108,11 +86,8 @@ def metric_distributions(values: Mapping[str, Any]) -> dict[str, str]:
     from cfx.core import registry
     from cfx.evaluation.metrics.base import entries_of
 
-    found = {}
-    for entry in entries_of(values.get("metrics", "all")):
-        if entry.distribution != registry.OWN:
-            found[entry.distribution] = entry.version
-    return found
+    entries = entries_of(values.get("metrics", "all"))
+    return {one.distribution: one.version for one in entries if one.distribution != registry.OWN}
 
 
 def process_tags() -> dict[str, str]:
@@ -146,10 +121,9 @@ def is_alive(tags: Mapping[str, str]) -> bool:
 
 def user() -> str:
     """Returns the user's name, "" where the system knows none."""
-    try:
+    with suppress(KeyError, OSError, ImportError):
         return getpass.getuser()
-    except (KeyError, OSError, ImportError):
-        return os.environ.get("USER", "")
+    return ""
 
 
 def flatten(config: Mapping[str, Any]) -> dict[str, str]:
@@ -169,20 +143,16 @@ def flatten(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _leaves(value: Any, path: str) -> Iterable[tuple[str, Any]]:
-    items: Iterable[tuple[Any, Any]]
-    if isinstance(value, Mapping) and value:
+    items: Iterable[tuple[Any, Any]] = ()
+    if isinstance(value, Mapping):
         items = value.items()
-    elif isinstance(value, list | tuple) and _has_nested(value):
+    elif isinstance(value, list | tuple) and any(_is_nested(part) for part in value):
         items = enumerate(value)
-    else:
+    if not items:
         yield path, value
-        return
     for key, part in items:
-        below = str(key)
-        if path:
-            below = f"{path}.{key}"
-        yield from _leaves(part, below)
+        yield from _leaves(part, f"{path}.{key}" if path else str(key))
 
 
-def _has_nested(values: Iterable[Any]) -> bool:
-    return any(isinstance(value, Mapping | list | tuple) for value in values)
+def _is_nested(value: Any) -> bool:
+    return isinstance(value, Mapping | list | tuple)

@@ -1,21 +1,15 @@
 """What a table of a job's results is, which are installed, and how they are written and read.
 
 A table is a class of its own: which columns it has, what its rows are made of, which metrics and
-which lines of the console summarise it. A distribution brings one by an entry point, whose name
-becomes that of its file:
-
-    [project.entry-points."cfx.tables"]
-    lane_changes = "my_package.tables:LaneChanges"
-
-Jobs write every installed table into their folder and into MLflow; `cfx.load` and reports read it
-back. A figure of reports takes it from `Results.tables`.
+which lines of the console summarise it. A distribution brings one by an entry point of the group
+`cfx.tables`, whose name becomes that of its file. Jobs write every installed table into their
+folder and into MLflow; `cfx.load`, reports and figures (`Results.tables`) read it back.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -41,9 +35,6 @@ if TYPE_CHECKING:
     from cfx.data.style import StyleResult
     from cfx.evaluation.protocols.base import ProtocolResult
     from cfx.evaluation.result import Evaluation
-
-_CELL_BYTES = 8
-"""At the least."""
 
 
 @dataclass(frozen=True)
@@ -103,9 +94,8 @@ class Findings:
 class ResultTable(Component):
     """Base of every table of results.
 
-    Life cycle: a job makes every installed table and calls `rows` once, before anything is drawn or
-    logged; then `metrics`, and at its end `console`. Those that a job has no rows of are not asked
-    any further.
+    Life cycle: a job calls `rows` of every installed table once, before anything is drawn or
+    logged; where it has any, `metrics`, and at its end `console`.
 
     Attributes:
         meaning: what a row is, in a few words; the list of files in the documentation says it.
@@ -144,12 +134,7 @@ class ResultTable(Component):
         return {}
 
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[RenderableType]:
-        """Returns what the job prints about it at its end; it fits 80 columns.
-
-        Args:
-            findings: of the job.
-            metrics: all of the job.
-        """
+        """Returns what the job prints about it at its end; it fits 80 columns."""
         return ()
 
     def write(self, path: Path, parts: Iterable[pd.DataFrame]) -> None:
@@ -161,14 +146,12 @@ class ResultTable(Component):
         if self.suffix == ".csv":
             pd.concat(list(parts)).to_csv(path, index=False)
             return
-        with ExitStack() as opened:
-            writer: pq.ParquetWriter | None = None
-            for part in parts:
-                schema = None if writer is None else writer.schema
-                rows = pa.Table.from_pandas(part, schema, preserve_index=False)
-                if writer is None:
-                    writer = opened.enter_context(pq.ParquetWriter(path, rows.schema))
-                writer.write_table(rows)
+        remaining = iter(parts)
+        first = pa.Table.from_pandas(next(remaining), preserve_index=False)
+        with pq.ParquetWriter(path, first.schema) as writer:
+            writer.write_table(first)
+            for part in remaining:
+                writer.write_table(pa.Table.from_pandas(part, first.schema, preserve_index=False))
 
     def read(self, path: Path) -> pd.DataFrame:
         """Reads it back: its texts as texts, all other columns as numbers.
@@ -289,11 +272,7 @@ def metrics_table(
 ) -> Table:
     """Returns a table for the console with a row per method; what is not known is an empty cell.
 
-    Args:
-        title: of the table.
-        methods: the rows.
-        columns: by heading what a metric is called before `/METHOD`, and how it is formatted.
-        metrics: of the job.
+    `columns`: by heading what a metric is called before `/METHOD`, and how it is formatted.
     """
     from rich.table import Table
 
@@ -311,11 +290,7 @@ def metrics_table(
 
 
 def read_tables(folder: Path, *names: str) -> dict[str, pd.DataFrame]:
-    """Reads the tables of a finished job's folder, by name; those that are not there are left out.
-
-    Args:
-        folder: of the job.
-        names: of the tables; all installed ones if left out.
+    """Reads the tables of a finished job's folder, all or some; what is not there is left out.
 
     Raises:
         DataError: a file cannot be read, or is not what a job writes.
@@ -331,7 +306,15 @@ def read_tables(folder: Path, *names: str) -> dict[str, pd.DataFrame]:
 def _load(path: Path, texts: list[str]) -> pd.DataFrame:
     # Most of pyarrow's and pandas' errors are ValueErrors or OSErrors.
     try:
-        _check_memory(path)
+        needed = float(path.stat().st_size)
+        if path.suffix == ".parquet":  # a short file may mean a long table, of 8 bytes a cell
+            about = pq.read_metadata(path)
+            needed = 8.0 * about.num_rows * about.num_columns
+        if needed > total_memory():
+            raise DataError(
+                f"{path} holds a table of {in_units(needed)}, more than this machine's memory; no"
+                " job writes so much"
+            )
         if path.suffix == ".parquet":
             return pd.read_parquet(path)
         # An id such as "NA" is an id, and "007" is no number.
@@ -341,16 +324,3 @@ def _load(path: Path, texts: list[str]) -> pd.DataFrame:
         return pd.read_csv(path, dtype=types, keep_default_na=False, na_values=empty)
     except (OSError, ValueError, ArithmeticError, pa.ArrowException) as error:
         raise unreadable(path, error) from error
-
-
-def _check_memory(path: Path) -> None:
-    """Checks that a table fits the memory: a short file may mean a long table."""
-    needed = float(path.stat().st_size)
-    if path.suffix == ".parquet":
-        found = pq.read_metadata(path)
-        needed = float(found.num_rows) * found.num_columns * _CELL_BYTES
-    if needed > total_memory():
-        raise DataError(
-            f"{path} holds a table of {in_units(needed)}, more than this machine's memory; no job"
-            " writes so much"
-        )

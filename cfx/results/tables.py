@@ -5,13 +5,27 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import pandas as pd
 from rich.console import RenderableType
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
 
 from cfx.calibration.identifiability import flat_for
+from cfx.calibration.settings import (
+    DETERMINED,
+    DIVERGENT,
+    ENOUGH,
+    LEVEL,
+    MIXED,
+    OFF,
+    RELIABLE,
+    reliable,
+)
+from cfx.core.parameters import Parameter
 from cfx.data.site_styles import style_distances, styles_by_site
 from cfx.data.style import INDICATORS
 from cfx.evaluation.result import METHODS
@@ -19,7 +33,6 @@ from cfx.evaluation.sites import ALL, BASELINES
 from cfx.evaluation.tables import scope_label
 from cfx.learners.curves import best_losses
 from cfx.policies.context import LEVEL as EXPECTED_LEVEL
-from cfx.results.known import KnownParameters
 from cfx.results.table import Column, Findings, ResultTable
 
 PAIR = Column("pair_id", "", "the pair of leader and follower", "text")
@@ -138,12 +151,13 @@ class Curves(ResultTable):
 
     def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
         # The same types whether anything was learned or not.
-        curves = findings.protocol_result.curves
-        return [
-            curves.astype(
-                {"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float}
-            )
-        ]
+        types: dict[str, Any] = {
+            "network": str,
+            "epoch": "int64",
+            "train_loss": float,
+            "validation_loss": float,
+        }
+        return [findings.protocol_result.curves.astype(types)]
 
     def metrics(self, findings: Findings) -> dict[str, float]:
         return best_losses(findings.protocol_result.curves)
@@ -161,12 +175,7 @@ class Style(ResultTable):
         Column("score", "1", "weighted sum of the indicators; large is aggressive"),
         Column("cluster", "1", "0, 1 or 2: conservative, normal, aggressive", "int"),
         Column("cluster_name", "", "the cluster by name", "text", required=False),
-        Column("mean_speed", "m/s", "an indicator", required=False),
-        Column("variance_speed", "m2/s2", "an indicator", required=False),
-        Column("mean_acceleration", "m/s2", "an indicator", required=False),
-        Column("variance_acceleration", "m2/s4", "an indicator", required=False),
-        Column("mean_space_headway", "m", "an indicator", required=False),
-        Column("mean_time_headway", "s", "an indicator", required=False),
+        *(Column(one.name, one.unit, "an indicator", required=False) for one in INDICATORS),
         Column("frames", "1", "frames of the driver", "int", required=False),
         Column("standing_frames", "1", "frames in which the driver stands", "int", required=False),
         Column("site", "", "the road or area; several are joined by `; `", "text", required=False),
@@ -199,8 +208,8 @@ class Labels(ResultTable):
             yield labels.to_frame(findings.pairs, findings.evaluation.names)
 
     def metrics(self, findings: Findings) -> dict[str, float]:
-        assert findings.protocol_result.labels is not None
-        return findings.protocol_result.labels.metrics()
+        labels = findings.protocol_result.labels
+        return {} if labels is None else labels.metrics()
 
 
 class Platoon(ResultTable):
@@ -222,8 +231,8 @@ class Platoon(ResultTable):
         return [None if platoon is None else platoon.table]
 
     def metrics(self, findings: Findings) -> dict[str, float]:
-        assert findings.evaluation.platoon is not None
-        return findings.evaluation.platoon.metrics()
+        platoon = findings.evaluation.platoon
+        return {} if platoon is None else platoon.metrics()
 
 
 class History(ResultTable):
@@ -262,6 +271,133 @@ class Slices(ResultTable):
         Column("loss", "as of the objective", "the loss there, without the prior"),
         Column("best_loss", "as of the objective", "the loss with the calibrated parameters"),
     )
+
+
+_CORRELATED = 0.3
+"""Correlation that noise may keep before the job says so."""
+
+
+@dataclass(frozen=True)
+class KnownParameters:
+    """What a job's fits say of how well drivers' parameters are known.
+
+    Attributes:
+        rows: the posterior's columns, a row per pair.
+        parameters: those that were calibrated.
+    """
+
+    rows: pd.DataFrame
+    parameters: tuple[Parameter, ...]
+
+    @classmethod
+    def of(cls, findings: Findings) -> KnownParameters | None:
+        """Returns them; None where the job asked for no posterior."""
+        evaluation = findings.evaluation
+        fits = evaluation.tables.get("fits")
+        if fits is None or "noise_scale" not in fits:
+            return None
+        tuned = tuple(one for one in evaluation.parameters if f"median_{one.name}" in fits)
+        return cls(fits[fits["method"] == "fixed"], tuned)
+
+    @property
+    def reliable(self) -> pd.Series:
+        """Whether a pair's intervals are to be relied on."""
+        return reliable(self.rows)
+
+    def determined(self, name: str) -> int:
+        """Returns how many pairs' recordings determine a parameter, as far as that is known."""
+        return int(((self.rows[f"contraction_{name}"] >= DETERMINED) & self.reliable).sum())
+
+    def metrics(self) -> dict[str, float]:
+        """Returns what MLflow keeps too.
+
+        `posterior/determined/NAME` and `posterior/reliable` are shares of pairs,
+        `posterior/noise_left`, `posterior/effective_samples` and `posterior/expected_coverage`
+        (`sbi`) medians.
+        """
+        found = {}
+        for one in self.parameters:
+            found[f"posterior/determined/{one.name}"] = self.determined(one.name) / len(self.rows)
+        found["posterior/reliable"] = float(self.reliable.mean())
+        for name in ("noise_left", "effective_samples", "expected_coverage"):
+            if name in self.rows:
+                found[f"posterior/{name}"] = float(self.rows[name].median())
+        return found
+
+    def printed(self) -> list[RenderableType]:
+        """Returns the table of parameters, then what is not determined, then a warning if due."""
+        pairs = len(self.rows)
+        words = "" if pairs == 1 else f", median of {pairs} pairs"
+        table = Table(
+            title=f"What the recordings say of parameters{words}: {LEVEL:.0%} intervals",
+            title_justify="left",
+        )
+        table.add_column("parameter")
+        table.add_column("interval", justify="right")
+        table.add_column("determined for", justify="right")
+        open_ones = []
+        for one in self.parameters:
+            ends = (
+                float(self.rows[f"{end}_{one.name}"].median()) for end in ("median", "low", "high")
+            )
+            middle, low, high = ends
+            unit = "" if one.unit == "1" else f" {one.unit}"
+            interval = f"{middle:.3g}{unit} ({low:.3g} to {high:.3g})"
+            determined = self.determined(one.name)
+            table.add_row(one.name, interval, f"{determined} of {pairs}")
+            if determined < self.reliable.sum():
+                open_ones.append(f"{one.name} for {self.reliable.sum() - determined}")
+        sentences = self._doubts()
+        if open_ones:
+            sentences.append(
+                f"Hardly known after these recordings: {', '.join(open_ones)} of {pairs} pairs"
+                f" (intervals less than {DETERMINED:.0%} narrower than the prior's;"
+                " contraction_NAME in fits.parquet)."
+            )
+        left = float(self.rows["noise_left"].median())
+        if abs(left) > _CORRELATED:
+            sentences.append(
+                f"What the noise's model leaves is still correlated ({left:.2f} from step to step):"
+                " intervals may be too narrow; try calibration.noise_order=2 or longer steps"
+                " (calibration.noise_step_s)."
+            )
+        return [table, *map(Text, sentences)]
+
+    def _doubts(self) -> list[str]:
+        """Returns which pairs' intervals are not to be relied on, and which are rough."""
+        sentences = []
+        pairs = len(self.rows)
+        doubtful = list(self.rows["pair_id"][~self.reliable])
+        if doubtful:
+            named = ", ".join(map(str, doubtful[:3])) + (" ..." if len(doubtful) > 3 else "")
+            why = f"samples of these posteriors do not settle (pareto_k above {RELIABLE}"
+            if "r_hat" in self.rows:
+                why = (
+                    f"chains differ or leave out a part (r_hat above {MIXED} or divergences above"
+                    f" {DIVERGENT}"
+                )
+            such = "too narrow"
+            if "expected_coverage" in self.rows:
+                such = "the network's alone"
+            sentences.append(
+                f"Do not rely on the intervals of {len(doubtful)} of {pairs} pairs ({named}):"
+                f" {why} in fits.parquet), and such intervals are {such}."
+            )
+        if "expected_coverage" in self.rows:
+            held = float(self.rows["expected_coverage"].median())
+            if abs(held - LEVEL) > OFF:
+                sentences.append(
+                    f"Intervals of the network alone hold {held:.0%} of simulated drivers'"
+                    f" parameters instead of {LEVEL:.0%} (expected_coverage in fits.parquet): it"
+                    " has learned too little."
+                )
+        few = int((self.reliable & (self.rows["effective_samples"] < ENOUGH)).sum())
+        if few:
+            sentences.append(
+                f"The intervals of {few} of {pairs} pairs rest on fewer than {ENOUGH:.0f}"
+                " independent samples (effective_samples in fits.parquet): their ends are rough."
+            )
+        return sentences
 
 
 class Fits(ResultTable):
@@ -354,21 +490,21 @@ class Sites(ResultTable):
         return [findings.sites]
 
     def metrics(self, findings: Findings) -> Mapping[str, float]:
+        columns = {}
+        for method in METHODS:
+            for metric in ("rmse_speed", "rmse_gap"):
+                columns[f"{metric}_{method}"] = f"{metric}/{method}"
+        for baseline in BASELINES:
+            columns[f"over_{baseline}"] = f"rmse_improvement/{baseline}"
         found: dict[str, float] = {}
         table = findings.sites
         if table is None:
             return found
         for _, row in table[table["driver_type"] == ALL].iterrows():
             site = re.sub(r"[^\w.\- ]", "_", str(row["site"]))
-            prefix = f"site/{site}" if row["scope"] == "test" else f"full_trajectory/site/{site}"
-            for method in METHODS:
-                for metric in ("rmse_speed", "rmse_gap"):
-                    if f"{metric}_{method}" in row:
-                        found[f"{prefix}/{metric}/{method}"] = float(row[f"{metric}_{method}"])
-            for baseline in BASELINES:
-                if f"over_{baseline}" in row:
-                    value = float(row[f"over_{baseline}"])
-                    found[f"{prefix}/rmse_improvement/{baseline}"] = value
+            part = "" if row["scope"] == "test" else "full_trajectory/"
+            for column in row.index.intersection(list(columns)):
+                found[f"{part}site/{site}/{columns[column]}"] = float(row[column])
         return found
 
     def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
@@ -384,10 +520,11 @@ def _sites_printed(rows: pd.DataFrame, scope: str) -> Table:
     )
     table.add_column("site")
     table.add_column("drivers", justify="right")
-    methods = [one for one in METHODS if _is_there(rows, f"rmse_speed_{one}") and one != "shrunk"]
+    known = set(rows.dropna(axis=1, how="all"))
+    methods = [one for one in METHODS if f"rmse_speed_{one}" in known and one != "shrunk"]
     for method in methods:
         table.add_column(method, justify="right")
-    baselines = [one for one in BASELINES if _is_there(rows, f"over_{one}")]
+    baselines = [one for one in BASELINES if f"over_{one}" in known]
     for baseline in baselines:
         table.add_column(f"over {baseline}", justify="right")
     for _, row in rows.iterrows():
@@ -403,10 +540,6 @@ def _sites_printed(rows: pd.DataFrame, scope: str) -> Table:
             cells.append(cell)
         table.add_row(name, f"{row['drivers']}", *cells)
     return table
-
-
-def _is_there(rows: pd.DataFrame, name: str) -> bool:
-    return name in rows and bool(rows[name].notna().any())
 
 
 class SiteStyles(ResultTable):
@@ -476,8 +609,8 @@ class Past(ResultTable):
     suffix = ".csv"
     order = 115
     columns = (
-        Column("pair_id", "", "the pair of leader and follower", "text"),
-        Column("driver", "", "the follower of the pair", "text"),
+        PAIR,
+        DRIVER,
         Column("share", "1", "the policy's share of the acceleration in the test part"),
         Column(
             "past_rmse_speed_METHOD",

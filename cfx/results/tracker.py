@@ -24,17 +24,11 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 MLFLOW = "mlflow"
-"""The tracking that jobs have unless they name another; it comes with cfx-mlflow."""
+"""The tracking that jobs have unless they name another."""
 
 
 class Tracker:
-    """Tracks nothing: what a job uses if tracking is off.
-
-    `tracked` gives the one that fits the configuration.
-
-    Attributes:
-        run_id: of the job's run.
-    """
+    """Tracks nothing: what a job uses if tracking is off; `tracked` gives the one that fits."""
 
     run_id: str = ""
 
@@ -42,13 +36,7 @@ class Tracker:
         """Adds tags to the run."""
 
     def log_job(self, findings: Findings, kept: Kept, description: str) -> None:
-        """Logs what a job has found and written.
-
-        Args:
-            findings: of the job.
-            kept: what it has written.
-            description: what the run's page says of it, Markdown.
-        """
+        """Logs what a job has found and written; `description`, in Markdown, is for its page."""
 
     def how_to_open(self) -> tuple[str, ...]:
         """Returns lines that tell a user where to look."""
@@ -61,6 +49,8 @@ class Origin:
 
     Attributes:
         place: what people know it by, such as "MLflow run 0a1b...".
+        folder: with its files; None: it did not finish.
+        reason: why it did not.
         started: when.
         seconds: how long it took, s; None: nobody knows.
         version: of cfx.
@@ -68,25 +58,12 @@ class Origin:
     """
 
     place: str
+    folder: Path | None = None
+    reason: str = ""
     started: datetime | None = None
     seconds: float | None = None
     version: str = ""
     hydra: Path | None = None
-
-
-@dataclass(frozen=True)
-class TrackedJob:
-    """A job as its run tells it.
-
-    Attributes:
-        origin: which job.
-        folder: with its files; None: it did not finish.
-        reason: why it did not.
-    """
-
-    origin: Origin
-    folder: Path | None = None
-    reason: str = ""
 
 
 class Tracking(ABC):
@@ -102,24 +79,15 @@ class Tracking(ABC):
         A job that was broken off and starts again with the same configuration in the same folder
         goes on in its old run. The run says how its body ended.
 
-        Args:
-            config: the job's configuration.
-            folder: the job's output folder.
-
         Raises:
             TrackingError: the place cannot be used; raised before the job's work begins.
         """
 
     @abstractmethod
     def end_sweep(self, settings: Mapping[str, Any], sweep: str) -> tuple[str, ...]:
-        """Closes runs that killed jobs of a multirun left open.
+        """Closes runs that killed jobs of a multirun left open; returns lines that say where.
 
-        Args:
-            settings: of `tracking`.
-            sweep: the name that the jobs share.
-
-        Returns:
-            Lines that tell a user where to look.
+        `settings` are those of `tracking`, and `sweep` is the name that the jobs share.
 
         Raises:
             TrackingError: the place cannot be used.
@@ -134,17 +102,14 @@ class Tracking(ABC):
         """Returns a folder with the files of a tracked job.
 
         They are those that a job's folder has, such as `metrics.json`, `pairs.csv` and `policy/`.
-
-        Args:
-            run_id: of the run.
-            uri: as `tracking.uri`.
+        `uri` is as `tracking.uri`.
 
         Raises:
             TrackingError: there is no such run, or its files are gone.
         """
 
     @abstractmethod
-    def jobs_of_run(self, run_id: str) -> list[TrackedJob]:
+    def jobs_of_run(self, run_id: str) -> list[Origin]:
         """Returns the job of a run; of a sweep's run, its jobs, the earliest first.
 
         Raises:
@@ -184,34 +149,26 @@ def tracked(config: JobConfig, folder: Path) -> Iterator[Tracker]:
 
 
 def tracking_of_run(text: str) -> Tracking:
-    """Returns the tracking whose run this may be; MLflow where it is none's.
+    """Returns the first tracking of whose runs this could be the id; MLflow where it is none's.
 
     Raises:
         TrackingError: no tracking is installed.
     """
-    tracking = _whose_run(text)
-    if tracking is not None:
-        return tracking
-    if MLFLOW not in registry.names("tracker"):
+    installed = {name: tracking_named(name) for name in registry.names("tracker")}
+    for tracking in installed.values():
+        if tracking.is_run_id(text):
+            return tracking
+    if MLFLOW not in installed:
         raise TrackingError(
             f"'{text}' is no job's output folder; to name a job by its run in MLflow:"
             f" {install_line('cfx-mlflow')}"
         )
-    return tracking_named(MLFLOW)
+    return installed[MLFLOW]
 
 
 def is_run_id(text: str) -> bool:
     """Says whether this could be the id of a run of an installed tracking."""
-    return _whose_run(text) is not None
-
-
-def _whose_run(text: str) -> Tracking | None:
-    """Returns the first installed tracking of whose runs this could be the id; None: of none."""
-    for name in registry.names("tracker"):
-        tracking = tracking_named(name)
-        if tracking.is_run_id(text):
-            return tracking
-    return None
+    return any(tracking_named(name).is_run_id(text) for name in registry.names("tracker"))
 
 
 def folder_of(folder_or_run: str | Path, uri: str | None = None) -> Path:

@@ -15,11 +15,11 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-import cfx.app.job.output
+import cfx.app.job.results
 import cfx.calibration.cache
 import cfx.core.files
 import cfx.data.tidy
-import cfx.figures.write
+import cfx.figures.figure
 import cfx.policies.checkpoint
 from cfx.app import cli
 from cfx.core.errors import Terminated
@@ -33,8 +33,8 @@ MODULES = (
     cfx.calibration.cache,
     cfx.data.tidy,
     cfx.core.files,
-    cfx.app.job.output,
-    cfx.figures.write,
+    cfx.app.job.results,
+    cfx.figures.figure,
 )
 """Whoever writes files."""
 
@@ -87,7 +87,7 @@ def unrendered(figure: Figure, file: Path, **options: object) -> None:
 
 def job(folder: Path, faults: Faults, monkeypatch: pytest.MonkeyPatch) -> int:
     with monkeypatch.context() as patched:
-        patched.setattr(cfx.figures.write, "draw", undrawn)
+        patched.setattr(cfx.figures.figure, "draw", undrawn)
         patched.setattr(Figure, "savefig", unrendered)
         for module in MODULES:
             patched.setattr(module, "atomic_write", faults.atomic_write)

@@ -10,7 +10,7 @@ import torch
 
 import cfx
 from cfx.app.hydra_source import composed, plain
-from cfx.app.job import run_job
+from cfx.app.job.run import run_job
 from cfx.core import registry
 from cfx.core.errors import ConfigError, PluginError
 from cfx.models.krauss import Krauss

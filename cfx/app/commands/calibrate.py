@@ -13,8 +13,6 @@ from cfx.core.files import path_override
 _CHOSEN = {"policy": "fixed", "protocol": "within_driver"}
 """What a calibration chooses in place of the usual options; the command line may choose others."""
 
-_OWN_COLUMNS = ("data.columns", "data.units")
-
 
 class CalibrateCommand(Command):
     """Calibrates a driving model to recordings."""
@@ -52,10 +50,7 @@ class CalibrateCommand(Command):
 
 
 def overrides_of(words: Sequence[str]) -> list[str]:
-    """Returns the overrides of the job that calibrates a model to files.
-
-    Args:
-        words: files and overrides.
+    """Returns the overrides of the job that calibrates a model; words are files and overrides.
 
     Raises:
         ConfigError: an override chooses a policy that is trained.
@@ -71,19 +66,13 @@ def overrides_of(words: Sequence[str]) -> list[str]:
             )
     found = [f"{key}={value}" for key, value in _CHOSEN.items() if key not in keys]
     if files and "data" not in keys:
-        found.append(f"data={_dataset_of(files[0], given)}")
+        from cfx.data.describe import dataset_of
+
+        own_columns = any(word.startswith(("data.columns", "data.units")) for word in given)
+        found.append(f"data={'tidy' if own_columns else dataset_of(files[0])}")
     if len(files) == 1:
         found.append(path_override("data.path", files[0]))
     elif files:
         listed = [path_override("", file).removeprefix("=") for file in files]
         found.append(f"data.path=[{','.join(listed)}]")
     return [*found, *given]
-
-
-def _dataset_of(file: Path, given: Sequence[str]) -> str:
-    """Returns which dataset reads a file: with columns of its own, the tidy one."""
-    from cfx.data.describe import dataset_of
-
-    if any(word.startswith(_OWN_COLUMNS) for word in given):
-        return "tidy"
-    return dataset_of(file)

@@ -6,15 +6,10 @@ import argparse
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from cfx.core.command import Command
-from cfx.core.errors import CfxError, ConfigError, DataError
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-    from cfx.data.style import StyleResult
+from cfx.core.errors import ConfigError, DataError
 
 
 class DataCommand(Command):
@@ -58,6 +53,8 @@ def _describe(options: argparse.Namespace) -> None:
             `--style` has nothing to compare.
         DataError: a file cannot be used; or a pair stands in two of those that are compared.
     """
+    import pandas as pd
+
     from cfx.data.base import joined
     from cfx.data.describe import describe_sites, describe_style, described
     from cfx.data.site_styles import style_distances
@@ -104,21 +101,12 @@ def _describe(options: argparse.Namespace) -> None:
         distances = style_distances(style)
         print(f"\n{describe_style(style, distances)}")
         if figure is not None:
-            _draw(style, distances, figure)
+            from cfx.figures.figure import Results, drawn, write_figure
 
-
-def _draw(style: StyleResult, distances: pd.DataFrame | None, path: Path) -> None:
-    """Draws the driving styles of sites into a file."""
-    import pandas as pd
-
-    from cfx.figures.figure import Results
-    from cfx.figures.write import drawn, write_figure
-
-    tables = {} if distances is None else {"style_distances": distances}
-    write_figure(
-        drawn("site_styles", Results(pd.DataFrame(), (), (), style=style, tables=tables)), path
-    )
-    print(f"\nFigure: {path}")
+            tables = {} if distances is None else {"style_distances": distances}
+            results = Results(pd.DataFrame(), (), (), style=style, tables=tables)
+            write_figure(drawn("site_styles", results), figure)
+            print(f"\nFigure: {figure}")
 
 
 _FIGURES = (".png", ".svg", ".pdf")
@@ -137,13 +125,9 @@ def _settings(overrides: Sequence[str]) -> dict[str, Any]:
         ConfigError: one of them fits nothing.
     """
     from cfx.app import hydra_source
-    from cfx.app.user_errors import explain, is_user_error
+    from cfx.app.user_errors import explained
 
     if not any(word.startswith("data=") for word in overrides):
         overrides = ["data=tidy", *overrides]
-    try:
+    with explained(overrides):
         return dict(hydra_source.plain(hydra_source.composed(overrides))["data"])
-    except Exception as error:
-        if is_user_error(error) and not isinstance(error, CfxError):
-            raise ConfigError(explain(error, overrides)) from None
-        raise

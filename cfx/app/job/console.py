@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -36,62 +36,55 @@ def report(
     tables: Sequence[WrittenTable],
     console: Console,
 ) -> None:
-    """Prints what was measured.
-
-    Args:
-        findings: what was measured.
-        metrics: of the job.
-        tables: those that it has.
-        console: where it is printed.
-    """
+    """Prints what was measured."""
     evaluation = findings.evaluation
     console.print(methods_table(evaluation, metrics))
     if "full_trajectory" in evaluation.improvements:
         console.print(methods_table(evaluation, metrics, "full_trajectory"))
-    if evaluation.purpose is Purpose.CALIBRATION:
-        _print_headline(metrics, console)
-    elif evaluation.purpose is Purpose.ADAPTATION:
-        _print_improvements(evaluation, console)
-        _print_headline(metrics, console)
-    else:
-        text = (
+    sentences = []
+    compared = _comparisons(evaluation)
+    if evaluation.purpose is Purpose.ADAPTATION and compared:
+        console.print(_improvements_table(compared))
+        sentences += _doubts(compared)
+    if evaluation.purpose is Purpose.POLICY:
+        sentences.append(
             "With constant parameters the model follows no leader: compare the policy's RMSE"
             " with other jobs'."
         )
-        console.print(text, soft_wrap=True)
+    else:  # the one number by which the job is known elsewhere: in MLflow, a report, Python
+        _, words = headline(metrics)
+        sentences += [f"In short: {words}."] if words else []
+    _say(sentences, console)
     for table in tables:
         for printed in table.console(findings, metrics):
             console.print(printed)
-    _print_safety(evaluation, metrics, console)
-    _print_flat(evaluation, console)
+    sentences = _safety(evaluation, metrics)
     for scope, words in evaluation.outside.items():
-        text = f"Policy, {scope_label(scope)}: {words}; there it fades towards its base parameters."
-        console.print(text, soft_wrap=True, highlight=False)
+        sentences.append(
+            f"Policy, {scope_label(scope)}: {words}; there it fades towards its base parameters."
+        )
     for one in evaluation.left_out:
-        text = f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
-        console.print(text, soft_wrap=True, highlight=False)
+        sentences.append(
+            f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
+        )
+    _say(sentences, console)
 
 
 def report_places(
     folder: Path, console: Console, tracker: Tracker, copied_to: str | None = None
 ) -> None:
-    """Prints where the results are and how to open them.
-
-    Args:
-        folder: of the job.
-        console: where it is printed.
-        tracker: says how to open the job's run.
-        copied_to: URL of the folder's copy; None without.
-    """
-    console.print(f"Results: {folder}", soft_wrap=True, highlight=False, markup=False)
+    """Prints where the results are, and their copy (a URL), and how to open them."""
+    lines = [f"Results: {folder}"]
     if copied_to is not None:
-        console.print(f"Copied to: {copied_to}", soft_wrap=True, highlight=False, markup=False)
+        lines.append(f"Copied to: {copied_to}")
     for page in sorted(folder.glob(f"*/{PAGE}")):
-        console.print(
-            f"Demonstration, for any browser: {page}", soft_wrap=True, highlight=False, markup=False
-        )
-    for line in tracker.how_to_open():
-        console.print(line, soft_wrap=True, highlight=False, markup=False)
+        lines.append(f"Demonstration, for any browser: {page}")
+    _say([*lines, *tracker.how_to_open()], console, markup=False)
+
+
+def _say(sentences: Iterable[str], console: Console, *, markup: bool = True) -> None:
+    for sentence in sentences:
+        console.print(sentence, soft_wrap=True, highlight=False, markup=markup)
 
 
 def methods_table(
@@ -150,32 +143,19 @@ def _cell(metric: MetricInfo, value: float | None) -> str:
     return f"{value:.3f}"
 
 
-def _print_improvements(evaluation: Evaluation, console: Console) -> None:
-    """Prints a table of the comparisons of the policy with baselines, and what limits it."""
-    compared = _comparisons(evaluation)
-    if not compared:
-        return
-    console.print(improvements_table(compared))
+def _doubts(compared: Mapping[str, Improvement]) -> list[str]:
+    """Returns what limits the comparisons of the policy with baselines."""
+    sentences = []
     for over, one in compared.items():
         if one.undefined:
             baseline = over.partition(",")[0]
-            text = (
+            sentences.append(
                 f"Over {' '.join(over.split())}: {one.undefined} of {one.pairs + one.undefined}"
                 f" pairs have no improvement: a simulation diverged, or {baseline} has no error at"
                 " all."
             )
-            console.print(text, soft_wrap=True, highlight=False)
-    drivers = max(one.drivers for one in compared.values())
-    warning = few_drivers(drivers)
-    if warning:
-        console.print(warning, soft_wrap=True, highlight=False)
-
-
-def _print_headline(metrics: Mapping[str, float], console: Console) -> None:
-    """Prints the one number by which the job is known elsewhere: in MLflow, a report, Python."""
-    _, words = headline(metrics)
-    if words:
-        console.print(f"In short: {words}.", soft_wrap=True, highlight=False)
+    warning = few_drivers(max(one.drivers for one in compared.values()))
+    return [*sentences, warning] if warning else sentences
 
 
 def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
@@ -195,7 +175,7 @@ def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
     return found
 
 
-def improvements_table(compared: Mapping[str, Improvement]) -> Table:
+def _improvements_table(compared: Mapping[str, Improvement]) -> Table:
     """Returns a row per baseline: mean, interval, median, and for how many pairs it is better.
 
     It fits 80 columns. The other statistics are in `metrics.json` and in the report.
@@ -223,8 +203,8 @@ def improvements_table(compared: Mapping[str, Improvement]) -> Table:
     return table
 
 
-def _print_safety(evaluation: Evaluation, metrics: Mapping[str, float], console: Console) -> None:
-    """Prints a line about hard braking and parameters at their bounds, if there are any."""
+def _safety(evaluation: Evaluation, metrics: Mapping[str, float]) -> list[str]:
+    """Returns what is to be said of hard braking, of bounds, and of undetermined parameters."""
     sentences = []
     braking = _methods_above(evaluation, metrics, "hard_braking", 1, ".0f")
     if braking:
@@ -232,21 +212,16 @@ def _print_safety(evaluation: Evaluation, metrics: Mapping[str, float], console:
     if metrics.get("at_bounds/policy", 0.0) >= 0.01:
         at_bounds = _methods_above(evaluation, metrics, "at_bounds", 0.01, ".0%")
         sentences.append(f"Parameters at their bounds: {at_bounds}.")
-    if sentences:
-        console.print(" ".join(sentences), soft_wrap=True, highlight=False)
-
-
-def _print_flat(evaluation: Evaluation, console: Console) -> None:
-    """Prints which driver-specific parameters the recordings do not determine, if there are any."""
+    lines = [" ".join(sentences)] if sentences else []
     shares = flat_for(evaluation.table, evaluation.names)
     pairs = int((evaluation.about["method"] == "fixed").sum())
     found = [f"{name} for {share * pairs:.0f}" for name, share in shares.items() if share > 0]
     if found:
-        text = (
+        lines.append(
             f"Not determined: {', '.join(found)} of {pairs} pairs (within {100 * NEAR:.0f} % of the"
             " best loss from bound to bound; flat_NAME is 1 in pairs.csv)."
         )
-        console.print(text, soft_wrap=True, highlight=False)
+    return lines
 
 
 def _methods_above(
@@ -261,20 +236,11 @@ def _methods_above(
     return ", ".join(found)
 
 
-_CHOSEN = ("model", "policy", "learner", "optimizer", "objective", "protocol")
-
-
 def described(config: JobConfig, findings: Findings, metrics: Mapping[str, float]) -> str:
-    """Returns what the job is, its result, its recordings, and the command that was typed.
-
-    Args:
-        config: of the job.
-        findings: of the job.
-        metrics: its results.
-    """
+    """Returns what the job is, its result, its recordings, and the command that was typed."""
     pairs = findings.pairs
     chosen = []
-    for group in _CHOSEN:
+    for group in ("model", "policy", "learner", "optimizer", "objective", "protocol"):
         if group == "learner" and findings.evaluation.purpose is Purpose.CALIBRATION:
             continue
         chosen.append(f"{group} **{getattr(config, group)['name']}**")

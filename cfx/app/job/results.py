@@ -1,20 +1,28 @@
-"""What a job leaves behind, and how it is read back."""
+"""What a job leaves behind: its folder, each file whole or not at all, a copy, and its result."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+import logging
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pandas as pd
+import yaml
 
-from cfx.app.job import output
 from cfx.app.overrides import command_of
-from cfx.core.errors import ConfigError, DataError, listed
+from cfx.core import registry
+from cfx.core.errors import ConfigError, DataError, OutputError, listed
+from cfx.core.files import atomic_write, remove_leftovers, write_json
 from cfx.core.guest import guest, visit
 from cfx.core.job_folder import examine, parse_yaml, read_metrics
+from cfx.core.storage import RemoteFolder
 from cfx.data.style import StyleResult
+from cfx.data.tidy import write_tidy
 from cfx.evaluation.headline import headline, improvement_key
 from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.statistics import STATISTICS
@@ -22,14 +30,267 @@ from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
-from cfx.results.table import Findings, read_tables
+from cfx.results.provenance import commit, version
+from cfx.results.table import (
+    Findings,
+    Kept,
+    WrittenTable,
+    file_of,
+    installed,
+    parts_of,
+    read_tables,
+)
 from cfx.results.tracker import Origin, folder_of
+from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from cfx.app.job.steps import Parts
     from cfx.figures.figure import Results
+
+log = logging.getLogger(__name__)
+
+METRICS = "metrics.json"
+"""The file that is written last: a folder that has it is complete."""
+
+_CONFIG = "config.yaml"
+
+
+def begin(folder: Path, config: JobConfig) -> None:
+    """Makes a job's folder, if it is not there, and writes the job's configuration into it.
+
+    Where the folder holds an earlier job's results, these stay as they are until the new ones are
+    there, so that the folder never mixes two jobs.
+
+    Raises:
+        OutputError: the folder cannot be made, or not be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise OutputError(
+            f"cannot make the output folder {folder}: {error.strerror};"
+            " set hydra.run.dir to a place that can be written"
+        ) from error
+    with _writing(folder):
+        remove_leftovers(folder)
+        if not (folder / METRICS).is_file():
+            _write_config(folder, config)
+
+
+def write_job(
+    folder: Path,
+    config: JobConfig,
+    parts: Parts,
+    findings: Findings,
+    tell: Callable[[Mapping[str, float], Sequence[WrittenTable]], None] | None = None,
+) -> Kept:
+    """Writes all that a job leaves behind.
+
+    `tell` is told the results before figures are drawn, which takes seconds.
+
+    Raises:
+        CfxError: a demonstration cannot be shown, or a file cannot be written.
+    """
+    result = findings.protocol_result
+    with _writing(folder):
+        (folder / METRICS).unlink(missing_ok=True)
+        _write_config(folder, config)
+        tables = tables_of(findings, folder)
+        if any(pair.truth for pair in findings.pairs):
+            with atomic_write(folder / "data.parquet") as temporary:
+                write_tidy(findings.pairs, temporary)
+        metrics = measured(findings, tables)
+        if tell is not None:
+            tell(metrics, tables)
+        checkpoint.save(result.policy, folder / "policy")
+        figures: list[Path] = []
+        if config.figures.enabled:
+            figures = _write_figures(folder, config, findings, tables, metrics)
+        files = [
+            folder / name for name in (_CONFIG, METRICS, "data.json")
+        ]  # MLflow keeps these too
+        if parts.demo is not None and config.demo is not None:
+            own = folder / config.demo["name"]
+            own.mkdir(parents=True, exist_ok=True)
+            shown = findings.pairs, result.policy, findings.evaluation, config.protocol
+            files += parts.demo.write(own, *shown)
+        objective = {"name": config.objective["name"], "unit": parts.objective.unit}
+        write_json(folder / "data.json", _description(findings, objective))
+        defined = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
+        write_json(folder / METRICS, defined)
+    return Kept(folder, metrics, tables, figures, files)
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """Says in one sentence that the file system refuses what the block writes."""
+    try:
+        yield
+    except OSError as error:
+        raise OutputError(
+            f"cannot write into {folder}: {error.strerror or error};"
+            " the calibration is cached, so run again"
+        ) from error
+
+
+def _write_config(folder: Path, config: JobConfig) -> None:
+    values = config.model_dump(mode="json")
+    with atomic_write(folder / _CONFIG) as temporary:
+        temporary.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
+
+
+def tables_of(findings: Findings, folder: Path | None = None) -> list[WrittenTable]:
+    """Returns the tables of the results; of those that are large the rows are left out.
+
+    Those that an earlier job left in the folder go, if one is given; these are written there.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    tables = []
+    for about in installed():
+        parts = parts_of(about, findings)
+        path = None if folder is None else folder / file_of(about)
+        if parts is None:
+            if path is not None:
+                path.unlink(missing_ok=True)
+            continue
+        rows = None if about.part.large else pd.concat(list(parts))
+        if path is not None:
+            with atomic_write(path) as temporary:
+                about.part.write(temporary, parts if rows is None else [rows])
+        tables.append(WrittenTable(about, rows))
+    return tables
+
+
+def measured(findings: Findings, tables: Iterable[WrittenTable]) -> dict[str, float]:
+    """Returns all metrics of a job, those of its tables included."""
+    metrics = findings.evaluation.metrics() | dict(findings.protocol_result.calibration)
+    for table in tables:
+        metrics |= table.metrics(findings)
+    return metrics
+
+
+def results_of(
+    findings: Findings, tables: Iterable[WrittenTable], metrics: Mapping[str, float]
+) -> Results:
+    """Returns what figures are drawn from."""
+    from cfx.figures.figure import Results
+
+    rows = {table.about.name: table.rows for table in tables if table.rows is not None}
+    return Results.of(findings.evaluation, style=findings.style, tables=rows, metrics=metrics)
+
+
+def _write_figures(
+    folder: Path,
+    config: JobConfig,
+    findings: Findings,
+    tables: list[WrittenTable],
+    metrics: Mapping[str, float],
+) -> list[Path]:
+    from cfx.figures.figure import where_figures_are, write_figures
+
+    if not registry.installed("figure"):
+        log.warning("No figures are drawn. %s", where_figures_are())
+    results = results_of(findings, tables, metrics)
+    return write_figures(folder / "figures", results, formats=config.figures.formats)
+
+
+def _description(findings: Findings, objective: Mapping[str, str]) -> dict[str, Any]:
+    """Returns what `data.json` says: where the data came from, and what a report must know.
+
+    `objective`: name and unit of what calibration has minimised.
+    """
+    pairs, evaluation = findings.pairs, findings.evaluation
+    shown = ("name", "unit", "meaning", "low", "high")
+    parameters = [{key: getattr(one, key) for key in shown} for one in evaluation.parameters]
+    dropped = []
+    for drop in pairs.dropped:
+        dropped.append({"reason": drop.reason, "count": drop.count, "unit": drop.unit})
+    return {
+        "source": pairs.source,
+        "fingerprint": pairs.fingerprint,
+        "pairs": len(pairs),
+        "protocol": dict(findings.protocol_result.notes),
+        "dropped": dropped,
+        "parameters": parameters,
+        "purpose": evaluation.purpose,
+        "objective": dict(objective),
+        "transient_s": TRANSIENT_S,
+        "metrics": [metric.to_json() for metric in evaluation.measured],
+        "outside": dict(evaluation.outside),
+        "metrics_left_out": [asdict(one) for one in evaluation.left_out],
+        "cfx": version(),
+        "commit": commit(Path.cwd()),
+    }
+
+
+class Upload:
+    """The copy of a job's folder behind a URL.
+
+    At first it has the configuration alone, so that a store that cannot be written is known at
+    once. Results of an earlier job there stay as they are until the new ones come.
+
+    Raises:
+        CfxError: nobody knows such URLs, what they need is not installed, or the store cannot be
+            read or written.
+    """
+
+    def __init__(self, url: str, folder: Path) -> None:
+        self.url = f"{url.rstrip('/')}/{place_of(folder)}"
+        self._folder = folder
+        self._remote = RemoteFolder(self.url)
+        try:
+            if self._remote.read(METRICS) is None:
+                self._remote.put(_CONFIG, folder / _CONFIG)
+        except OSError as error:
+            raise OutputError(
+                f"cannot write to {self.url} ({error}); set output.url to a place"
+                " that can be written"
+            ) from error
+
+    def finish(self) -> None:
+        """Copies all files of the job; those that an earlier job left there go.
+
+        Raises:
+            OutputError: the store cannot be written.
+        """
+        names = []
+        for path in sorted(self._folder.rglob("*")):
+            is_temporary = path.name.startswith(".") and "@" in path.name
+            is_lock = path.name in {".lock", ".lock.lease"}  # of this machine alone
+            if path.is_file() and not is_lock and not is_temporary and path.name != METRICS:
+                names.append(path.relative_to(self._folder).as_posix())
+        try:
+            there = set(self._remote.names())
+            if {METRICS, _CONFIG} <= there:  # a job's; anything else is not ours to remove
+                self._remote.remove(METRICS)
+                for name in there - {METRICS, *names}:
+                    self._remote.remove(name)
+            for name in (*names, METRICS):
+                self._remote.put(name, self._folder / name)
+            log.info("The job's folder was copied to %s", self.url)
+        except OSError as error:
+            raise OutputError(
+                f"the job's results lie in {self._folder}, but cannot be copied to"
+                f" {self.url} ({error}); the calibration is cached, so run again"
+            ) from error
+
+
+def place_of(folder: Path) -> str:
+    """Returns where a job's folder is copied to, below the URL: its path from `outputs/` on.
+
+    Elsewhere it is its name, in a sweep after the sweep's.
+    """
+    parts = folder.absolute().parts
+    if "outputs" in parts[:-1]:
+        last = len(parts) - 1 - parts[::-1].index("outputs")
+        return "/".join(parts[last + 1 :])
+    if (folder.parent / "sweep.json").is_file():
+        return "/".join(parts[-2:])
+    return parts[-1]
 
 
 @dataclass(frozen=True)
@@ -137,27 +398,20 @@ class JobResult:
         Raises:
             DataError: there is no such figure, or the job has nothing of what it shows.
         """
-        from cfx.figures.write import drawn
+        from cfx.figures.figure import drawn
 
         return drawn(name, self._results)
 
     @cached_property
     def _results(self) -> Results:
         """What figures are drawn from."""
-        from cfx.figures.figure import Results
-        from cfx.figures.job import read_job
-
         if self.computed is None:
+            from cfx.figures.job import read_job
+
             assert self.folder is not None
-            return read_job(self.folder, Origin(str(self.folder))).results
+            return read_job(Origin(str(self.folder), self.folder)).results
         findings = self.computed.findings
-        rows = {}
-        for table in output.tables_of(findings):
-            if table.rows is not None:
-                rows[table.about.name] = table.rows
-        return Results.of(
-            findings.evaluation, style=findings.style, tables=rows, metrics=self.metrics
-        )
+        return results_of(findings, tables_of(findings), self.metrics)
 
     def save(self, folder: str | Path) -> JobResult:
         """Writes the job's folder, as a job of the command line does; MLflow is not told.
@@ -176,8 +430,8 @@ class JobResult:
             raise DataError(f"this job was read from {self.folder}; copy that folder")
         config, parts, findings = vars(self.computed).values()
         with visit():
-            output.begin(Path(folder), config)
-            kept = output.write_job(Path(folder), config, parts, findings)
+            begin(Path(folder), config)
+            kept = write_job(Path(folder), config, parts, findings)
         return replace(self, folder=Path(folder), figures=tuple(kept.figures))
 
     def __repr__(self) -> str:
@@ -194,7 +448,7 @@ class JobResult:
         return f"JobResult({', '.join(said)},\n  {folder})"
 
     def _repr_html_(self) -> str:
-        from cfx.figures.write import as_html
+        from cfx.figures.figure import as_html
 
         rows = {}
         for method in self.pairs["method"].unique() if "method" in self.pairs else ():

@@ -21,12 +21,7 @@ log = logging.getLogger(__name__)
 
 
 def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> JobResult:
-    """Runs one job and writes its results into `folder`.
-
-    Args:
-        config: the validated configuration.
-        folder: the job's output folder; made if it is not there.
-        console: where the table goes; stdout unless given.
+    """Runs one job and writes its results into `folder`, which is made if it is not there.
 
     Raises:
         CfxError: the user's mistake, in one sentence; nothing half-written is left.
@@ -39,28 +34,32 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     # These take seconds to import: a wrong path or column has been answered by now.
     from rich.console import Console
 
-    from cfx.app.job import output, steps
+    from cfx.app.job import results, steps
     from cfx.app.job.console import described, report, report_places
-    from cfx.app.job.output import Upload
-    from cfx.app.job.results import Computed, JobResult
     from cfx.results.tracker import tracked
 
     data = config.data
     console = console or Console()
     config, parts = steps.prepare(config)
-    output.begin(folder, config)
-    upload = Upload.of(config.output.url, folder)
+    results.begin(folder, config)
+    upload = None if config.output.url is None else results.Upload(config.output.url, folder)
     with tracked(config, folder) as tracker:
         if config.data != data:  # the protocol has determined other data
             pairs = load_pairs(parts.dataset)
         pairs, style = steps.select_pairs(pairs, config)
         if parts.demo is not None:
             parts.demo.check(pairs)
-        tracker.set_tags(steps.tags_of(pairs))
+        tracker.set_tags(
+            {
+                "dataset.fingerprint": pairs.fingerprint,
+                "dataset.source": pairs.source,
+                "dataset.pairs": str(len(pairs)),
+            }
+        )
         context = steps.compose(config, parts, pairs, style)
         findings = steps.find(context, parts, config.calibration)
         # Figures take seconds: the numbers are there before them.
-        kept = output.write_job(
+        kept = results.write_job(
             folder,
             config,
             parts,
@@ -72,41 +71,33 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         if upload is not None:
             upload.finish()
             tracker.set_tags({"cfx.output_url": upload.url})
-    copied_to = None if upload is None else upload.url
-    report_places(kept.folder, console, tracker, copied_to)
-    return JobResult(
+    report_places(kept.folder, console, tracker, None if upload is None else upload.url)
+    return results.JobResult(
         metrics=kept.metrics,
         pairs=findings.evaluation.table,
         policy=findings.protocol_result.policy,
         figures=tuple(kept.figures),
         folder=folder,
         run_id=tracker.run_id,
-        computed=Computed(config, parts, findings),
+        computed=results.Computed(config, parts, findings),
     )
 
 
 def compute(config: JobConfig, pairs: PairSet) -> JobResult:
     """Runs a job on pairs that are read already; writes nothing, caches nothing, tracks nothing.
 
-    Args:
-        config: the validated configuration.
-        pairs: what its dataset reads.
-
     Raises:
         CfxError: as `run_job`.
     """
-    from cfx.app.job import output, steps
-    from cfx.app.job.results import Computed, JobResult
+    from cfx.app.job import results, steps
 
-    config, parts = steps.prepare(config)
-    pairs, style = steps.select_pairs(pairs, config)
-    context = steps.compose(steps.uncached(config), parts, pairs, style)
+    config, parts, context = steps.without_files(config, pairs)
     findings = steps.find(context, parts, config.calibration)
-    return JobResult(
-        metrics=output.measured(findings, output.tables_of(findings)),
+    return results.JobResult(
+        metrics=results.measured(findings, results.tables_of(findings)),
         pairs=findings.evaluation.table,
         policy=findings.protocol_result.policy,
         figures=(),
         folder=None,
-        computed=Computed(config, parts, findings),
+        computed=results.Computed(config, parts, findings),
     )

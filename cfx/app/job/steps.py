@@ -48,7 +48,12 @@ from cfx.simulation.rollout import MemorySimulator, MemoryStepper
 from cfx.simulation.settings import WindowSettings
 from cfx.simulation.windows import Split
 
+log = logging.getLogger(__name__)
+
 _CONSTANT = ("default", "population", "fixed")
+
+_WINDOW_S = 0.5
+"""Length of a window in the paper, and with default settings at NGSIM's time step of 0.1 s."""
 
 
 def calibration_tables(
@@ -61,11 +66,7 @@ def calibration_tables(
 
     Returns:
         slices: see `cfx.calibration.identifiability.slices`.
-        fits: a row per pair and method: pair_id, driver, method, and train_rmse_speed,
-            test_rmse_speed (m/s), train_rmse_gap, test_rmse_gap (m): on the part that
-            driver-specific parameters were calibrated on, and on the test part, if there is one
-            (`split`). With a posterior
-            the rows of `fixed` have its columns (`DriverPosteriors.columns`) for that part too.
+        fits: see `cfx.results.tables.Fits`; with a posterior it has `DriverPosteriors.columns`.
         Further ones with a posterior, see `DriverPosteriors.tables`.
     """
     calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
@@ -88,10 +89,13 @@ def calibration_tables(
     for method in evaluation.methods:
         if method in _CONSTANT:
             parameters = _parameters(evaluation, method, ids, batch.leader_length)
+            of_method = evaluation.table[evaluation.table["method"] == method]
+            rows = of_method[["pair_id", "driver"]].reset_index(drop=True).assign(method=method)
             found = training_errors(context.calibrator, batch, last, parameters)
-            rows = _fits(evaluation, method, found)
-            if context.split == 1:  # nothing was tested
-                rows = rows.drop(columns=["test_rmse_speed", "test_rmse_gap"])
+            for name, values in found.items():
+                rows[f"train_{name}"] = values.cpu().numpy()
+                if context.split < 1:  # else nothing was tested
+                    rows[f"test_{name}"] = of_method[name].to_numpy(dtype=np.float64)
             if method == "fixed" and settings.posterior != "none":
                 solver = context.calibrator.solver
                 method_of = posterior_method(settings.posterior)
@@ -111,16 +115,6 @@ def _parameters(evaluation: Evaluation, method: str, ids: list[str], like: Tenso
     columns = [f"parameter_{name}" for name in evaluation.names]
     values = np.array(rows.loc[ids, columns], dtype=np.float64)
     return torch.as_tensor(values, dtype=like.dtype, device=like.device)
-
-
-def _fits(evaluation: Evaluation, method: str, train: dict[str, Tensor]) -> pd.DataFrame:
-    rows = evaluation.table[evaluation.table["method"] == method]
-    found = rows[["pair_id", "driver"]].reset_index(drop=True)
-    found["method"] = method
-    for name, values in train.items():
-        found[f"train_{name}"] = values.cpu().numpy()
-        found[f"test_{name}"] = rows[name].to_numpy(dtype=np.float64)
-    return found
 
 
 @dataclass(frozen=True)
@@ -147,9 +141,8 @@ class Parts:
         """Makes the components of a configuration around a protocol that is there already.
 
         Raises:
-            ConfigError: a setting is wrong, or two components do not fit each other.
-            PluginError: a component cannot be loaded.
-            CfxError: the simulator needs what is not installed, such as SUMO.
+            CfxError: a setting is wrong, two components do not fit each other, or one cannot be
+                loaded or needs what is not installed, such as SUMO.
         """
         model = cast(DrivingModel, registry.create("model", config.model))
         if "model" not in protocol.determines():  # else the policy has been trained already
@@ -180,22 +173,6 @@ class Parts:
         )
 
 
-def reported_objectives(config: JobConfig, objective: Objective) -> dict[str, Objective]:
-    """Returns the objectives whose values a calibration reports: cfx's own and the chosen one.
-
-    Args:
-        config: names the chosen objective.
-        objective: the chosen objective.
-    """
-    reported = {}
-    for entry in registry.entries("objective"):
-        if entry.distribution == registry.OWN:
-            made = registry.create("objective", {"name": entry.name})
-            reported[entry.name] = cast(Objective, made)
-    reported[config.objective["name"]] = objective
-    return reported
-
-
 def make_protocol(config: JobConfig) -> Protocol:
     """Returns the protocol, for which ids of MLflow runs, and URLs, have become folders.
 
@@ -221,10 +198,7 @@ def complete(config: JobConfig, protocol: Protocol) -> JobConfig:
         return config
     named = []
     for key, value in determined.items():
-        if "name" in value:
-            named.append(f"{key}={value['name']}")
-        else:
-            named.append(key)
+        named.append(f"{key}={value['name']}" if "name" in value else key)
     log.info("The protocol determines %s", ", ".join(named))
     return JobConfig.of({**config.model_dump(), **determined})
 
@@ -236,9 +210,7 @@ def choose_device(name: str) -> torch.device:
         ConfigError: the machine has no such device.
     """
     if name == "auto":
-        if torch.cuda.is_available():
-            return torch.device("cuda")
-        return torch.device("cpu")
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = torch.device(name)
     found = torch.cuda.device_count()
     if device.type == "cuda" and (device.index or 0) >= found:
@@ -247,21 +219,6 @@ def choose_device(name: str) -> torch.device:
             " write device=cpu or device=auto"
         )
     return device
-
-
-log = logging.getLogger(__name__)
-
-_WINDOW_S = 0.5
-"""Length of a window in the paper, and with default settings at NGSIM's time step of 0.1 s."""
-
-
-def tags_of(pairs: PairSet) -> dict[str, str]:
-    """Returns what MLflow's run says of the pairs."""
-    return {
-        "dataset.fingerprint": pairs.fingerprint,
-        "dataset.source": pairs.source,
-        "dataset.pairs": str(len(pairs)),
-    }
 
 
 def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
@@ -295,7 +252,17 @@ def select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResul
     pairs = select_cluster(pairs, style, config.style.cluster)
     for drop in pairs.dropped:
         log.info("Left out: %d %s (%s)", drop.count, drop.unit, drop.reason)
-    _check_window(config.windows.length, pairs.dt)
+    length = config.windows.length
+    usual = 0.5 * _WINDOW_S < length * pairs.dt < 2 * _WINDOW_S
+    if length == WindowSettings().length and not usual:
+        log.info(
+            "A window of %d steps lasts %.3g s in these recordings; settings are made for %g s:"
+            " say data.time_step=%g, or change windows.length and windows.stride",
+            length,
+            length * pairs.dt,
+            _WINDOW_S,
+            _WINDOW_S / length,
+        )
     if pairs.dt > COARSE_S:
         log.warning(
             "The time step is %.3g s: parameters calibrated in such steps are biased, since models"
@@ -305,21 +272,6 @@ def select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResul
             pairs.dt,
         )
     return pairs, style
-
-
-def _check_window(length: int, dt: float) -> None:
-    """Says so if the default number of steps makes windows much shorter or longer than usual."""
-    lasts = length * dt
-    usual = 0.5 * _WINDOW_S < lasts < 2 * _WINDOW_S
-    if length == WindowSettings().length and not usual:
-        log.info(
-            "A window of %d steps lasts %.3g s in these recordings; settings are made for %g s:"
-            " say data.time_step=%g, or change windows.length and windows.stride",
-            length,
-            lasts,
-            _WINDOW_S,
-            _WINDOW_S / length,
-        )
 
 
 def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult) -> ProtocolContext:
@@ -345,10 +297,16 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
         memory=bound,
         prior=prior_weight(config.calibration.prior),
     )
+    reported = {}
+    for entry in registry.entries("objective"):  # cfx's own and the chosen one
+        if entry.distribution == registry.OWN:
+            made = registry.create("objective", {"name": entry.name})
+            reported[entry.name] = cast(Objective, made)
+    reported[config.objective["name"]] = parts.objective
     calibrator = Calibrator(
         solver,
         cache=Cache(cache_folder),
-        reported=reported_objectives(config, parts.objective),
+        reported=reported,
         engine=parts.engine,
     )
     return ProtocolContext(
@@ -367,36 +325,34 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
     )
 
 
-def uncached(config: JobConfig) -> JobConfig:
-    """Returns a configuration that keeps no cache."""
-    return JobConfig.of({**config.model_dump(), "cache": {"enabled": False}})
+def without_files(config: JobConfig, pairs: PairSet) -> tuple[JobConfig, Parts, ProtocolContext]:
+    """Returns what a protocol works with, where a job keeps no cache and writes nothing.
+
+    Raises:
+        CfxError: a setting is wrong, or what a component needs is not there.
+    """
+    config, parts = prepare(config)
+    pairs, style = select_pairs(pairs, config)
+    uncached = JobConfig.of({**config.model_dump(), "cache": {"enabled": False}})
+    return config, parts, compose(uncached, parts, pairs, style)
 
 
 def find(context: ProtocolContext, parts: Parts, calibration: CalibrationSettings) -> Findings:
-    """Runs the protocol: it splits the pairs, calibrates, has the learner train, and evaluates.
-
-    Returns:
-        What it has delivered, with tables of the calibration.
+    """Runs the protocol; returns what it has delivered, with tables of the calibration.
 
     Raises:
         PluginError: it delivers no `ProtocolResult`.
     """
     with closing(context.simulator), closing(parts.engine):
-        return _found(parts, context, parts.protocol.run(context), calibration)
-
-
-def _found(
-    parts: Parts, context: ProtocolContext, result: object, calibration: CalibrationSettings
-) -> Findings:
-    """Returns what a protocol has delivered; see `find`."""
-    if not isinstance(result, ProtocolResult):
-        raise PluginError(
-            f"{registry.origin(parts.protocol)}: run must return a cfx.ProtocolResult,"
-            f" but returned a {type(result).__name__}"
-        )
-    purpose = Purpose.of(parts.model, parts.policy)
-    evaluation = replace(result.evaluation, purpose=purpose).distinct_methods()
-    tables = calibration_tables(context, evaluation, calibration)
+        result: object = parts.protocol.run(context)
+        if not isinstance(result, ProtocolResult):
+            raise PluginError(
+                f"{registry.origin(parts.protocol)}: run must return a cfx.ProtocolResult,"
+                f" but returned a {type(result).__name__}"
+            )
+        purpose = Purpose.of(parts.model, parts.policy)
+        evaluation = replace(result.evaluation, purpose=purpose).distinct_methods()
+        tables = calibration_tables(context, evaluation, calibration)
     if "slices" in tables:
         evaluation = evaluation.with_slices(tables["slices"])
     evaluation = replace(evaluation, tables={**evaluation.tables, **tables})

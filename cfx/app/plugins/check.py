@@ -34,11 +34,7 @@ class Verdict:
 
 
 def check(kind: str | None = None, name: str | None = None) -> int:
-    """Tries components and prints a table, hints, and complaints on stderr.
-
-    Args:
-        kind: one kind alone.
-        name: one name of that kind alone.
+    """Tries all components, those of a kind, or one; prints a table, hints and complaints.
 
     Returns:
         1 if a component is broken or shadowed, else 0.
@@ -66,14 +62,12 @@ def check(kind: str | None = None, name: str | None = None) -> int:
             entry.kind, entry.name, entry.distribution, entry.version, entry.location, one.state
         )
     put(rows)
-    for hint in _once([one.hint for one in verdicts]):
+    for hint in dict.fromkeys(one.hint for one in verdicts if one.hint):
         print(f"Hint: {hint}")
-    complaints = _once([one.complaint for one in verdicts])
+    complaints = dict.fromkeys(one.complaint for one in verdicts if one.complaint)
     for complaint in complaints:
         print(complaint, file=sys.stderr)
-    if complaints:
-        return 1
-    return 0
+    return 1 if complaints else 0
 
 
 @contextlib.contextmanager
@@ -87,22 +81,10 @@ def _unheard() -> Iterator[None]:
         logging.disable(before)
 
 
-def _once(texts: list[str]) -> list[str]:
-    """Returns each text once, without empty ones."""
-    found: list[str] = []
-    for text in texts:
-        if text and text not in found:
-            found.append(text)
-    return found
-
-
 def _chosen(kind: str | None, name: str | None) -> list[registry.Entry]:
     """Returns the entries of all kinds or one, of all names or one."""
-    kinds = list(registry.KINDS)
-    if kind is not None:
-        kinds = [registry.kind_of(kind).name]
     found = []
-    for one in kinds:
+    for one in registry.KINDS if kind is None else [registry.kind_of(kind).name]:
         for entry in registry.entries(one):
             if name is None or entry.name == name:
                 found.append(entry)
@@ -122,12 +104,13 @@ def examine(entry: registry.Entry) -> Verdict:
     try:
         cls = registry.get(entry.kind, entry.name)
         nodes.render(cls, entry.name)
-        required = []
-        for name, field in cls.schema.model_fields.items():
-            if registry.is_blank(field):
-                required.append(name)
+        fields = cls.schema.model_fields.items()
+        required = [name for name, field in fields if registry.is_blank(field)]
         if required:
-            return Verdict(entry, "fine", hint=_not_tried(entry, required))
+            group = registry.kind_of(entry.kind).group
+            keys = ", ".join(f"{group}.{name}" for name in required)
+            hint = f"{entry.kind} '{entry.name}' was loaded but not tried: it needs {keys}."
+            return Verdict(entry, "fine", hint=hint)
         component = registry.create(entry.kind, {"name": entry.name, **cls.trial})
         complaint = _broken_contract(entry, component)
     except NotInstalledError as error:
@@ -140,7 +123,14 @@ def examine(entry: registry.Entry) -> Verdict:
         complaint = f"{entry} cannot be used with its default settings: {registry.in_words(error)}"
     if complaint:
         return Verdict(entry, "broken", complaint)
-    return Verdict(entry, "fine", hint=_undeclared(entry))
+    if entry.distribution == registry.OWN or entry.api:
+        return Verdict(entry, "fine")
+    hint = (
+        f"{entry.distribution} declares no version of cfx's plugin API and counts as built for the"
+        " current one; its author can add to pyproject.toml:"
+        f' [project.entry-points."{registry.API_GROUP}"] {API_VERSION} = "{entry.package}"'
+    )
+    return Verdict(entry, "fine", hint=hint)
 
 
 def _shadow(entry: registry.Entry) -> str:
@@ -172,19 +162,3 @@ def _broken_contract(entry: registry.Entry, component: object) -> str:
     if len(found) > 1:
         text += f"; and {len(found) - 1} more"
     return f"{text}; cfx.contracts.check_contract in its own tests shows all of it"
-
-
-def _not_tried(entry: registry.Entry, required: list[str]) -> str:
-    keys = ", ".join(f"{registry.kind_of(entry.kind).group}.{name}" for name in required)
-    return f"{entry.kind} '{entry.name}' was loaded but not tried: it needs {keys}."
-
-
-def _undeclared(entry: registry.Entry) -> str:
-    """Returns a hint for a distribution that declares no version of the plugin API."""
-    if entry.distribution == registry.OWN or entry.api:
-        return ""
-    return (
-        f"{entry.distribution} declares no version of cfx's plugin API and counts as built for the"
-        " current one; its author can add to pyproject.toml:"
-        f' [project.entry-points."{registry.API_GROUP}"] {API_VERSION} = "{entry.package}"'
-    )

@@ -20,29 +20,19 @@ from cfx.core.errors import ConfigError, OutputError, PluginError
 
 _TEMPLATE = Path(__file__).parent / "template"
 
-_RESERVED = {"null", "true", "false", "nan", "inf"}
-"""What Hydra does not read as a name."""
-
 
 def create(kind: str, name: str, folder: Path | None = None) -> Path:
-    """Writes a package and says what to do with it.
-
-    Args:
-        kind: what the component is.
-        name: its name, as in `model=NAME`.
-        folder: where; `cfx-NAME` in the working directory unless given.
-
-    Returns:
-        The folder, which appears whole or not at all.
+    """Writes a package, whole or not at all, and says what to do with it; returns its folder.
 
     Raises:
         PluginError: there is no such kind, or the name is taken.
         ConfigError: the name cannot be one.
         OutputError: the folder exists or cannot be written.
     """
+    from copier import run_copy
+
     found = registry.kind_of(kind)
-    _check_name(name)
-    _check_free(found, name)
+    _check_name(found, name)
     words = _words(found, name)
     target = (folder or Path(words["distribution"])).expanduser()
     if target.exists():
@@ -50,7 +40,13 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
             f"{target} exists already; choose another folder with --folder, or remove it"
         )
     try:
-        _write(found, words, target)
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".cfx-new-") as temporary:
+            draft = Path(temporary) / "package"
+            for part in ("common", found.name):
+                template = str(_TEMPLATE / part)
+                run_copy(template, draft, data=words, defaults=True, overwrite=True, quiet=True)
+            draft.rename(target)
     except OSError as error:
         raise OutputError(
             f"{target} cannot be written ({error.strerror or error});"
@@ -60,21 +56,18 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
     return target
 
 
-def _check_name(name: str) -> None:
-    is_taken = keyword.iskeyword(name) or name in _RESERVED
-    if re.fullmatch(r"[a-z][a-z0-9_]*", name) and not is_taken:
-        return
-    advice = ""
-    better = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")
-    if better and better != name and not keyword.iskeyword(better):
-        advice = f", such as {better}"
-    raise ConfigError(
-        f"'{name}' cannot be a component's name: it must be an identifier in lower-case letters,"
-        f" digits and _{advice}"
-    )
-
-
-def _check_free(kind: registry.Kind, name: str) -> None:
+def _check_name(kind: registry.Kind, name: str) -> None:
+    """Refuses a name that cannot be one, or is taken."""
+    is_word = keyword.iskeyword(name) or name in {"null", "true", "false", "nan", "inf"}
+    if is_word or not re.fullmatch(r"[a-z][a-z0-9_]*", name):
+        advice = ""
+        better = re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_0123456789")
+        if better and better != name and not keyword.iskeyword(better):
+            advice = f", such as {better}"
+        raise ConfigError(
+            f"'{name}' cannot be a component's name: it must be an identifier in lower-case"
+            f" letters, digits and _{advice}"
+        )
     taken = [entry for entry in registry.entries(kind.name) if entry.name == name]
     if taken:
         raise PluginError(
@@ -91,6 +84,15 @@ def _check_free(kind: registry.Kind, name: str) -> None:
 
 def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
     """Returns what the templates call by name."""
+    from packaging.version import InvalidVersion, Version
+
+    import cfx
+
+    try:
+        major, minor = Version(cfx.__version__).release[:2]
+        requires = f"{registry.OWN}>={major}.{minor},<{major + 1}"  # the plugin API decides too
+    except (InvalidVersion, ValueError):  # a checkout that nobody installed
+        requires = registry.OWN
     class_name = "".join(part.capitalize() for part in name.split("_"))
     return {
         "kind": kind.name,
@@ -101,37 +103,8 @@ def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
         "package": f"cfx_{name}",
         "distribution": f"cfx-{name.replace('_', '-')}".rstrip("-"),
         "api": API_VERSION,
-        "requires": _requires(),
+        "requires": requires,
     }
-
-
-def _requires() -> str:
-    """Returns a range of cfx's versions from this one on.
-
-    Which of them fit is also the plugin API's to say.
-    """
-    from packaging.version import InvalidVersion, Version
-
-    import cfx
-
-    try:
-        major, minor = Version(cfx.__version__).release[:2]
-    except (InvalidVersion, ValueError):  # a checkout that nobody installed
-        return registry.OWN
-    return f"{registry.OWN}>={major}.{minor},<{major + 1}"
-
-
-def _write(kind: registry.Kind, words: dict[str, Any], target: Path) -> None:
-    from copier import run_copy
-
-    target.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=target.parent, prefix=".cfx-new-") as temporary:
-        draft = Path(temporary) / "package"
-        for part in ("common", kind.name):
-            run_copy(
-                str(_TEMPLATE / part), draft, data=words, defaults=True, overwrite=True, quiet=True
-            )
-        draft.rename(target)
 
 
 def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:

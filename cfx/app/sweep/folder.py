@@ -1,4 +1,4 @@
-"""The folder of a sweep: which one a command continues or makes, and the locks around it.
+"""The folder of a sweep: which one a command continues or makes, its locks, and its records.
 
 A folder and a job are used by one process at a time. The operating system frees their locks when
 the process ends, however it ends. Hashes of what was asked for say when two commands are the same
@@ -9,22 +9,23 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import json
 import logging
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from filelock import BaseFileLock, Timeout
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
-from cfx.app.sweep.record import Record
 from cfx.core.component import content_key
-from cfx.core.errors import CfxError, ConfigError
-from cfx.core.files import lock_for
+from cfx.core.errors import CfxError, ConfigError, DataError
+from cfx.core.files import lock_for, write_json
 from cfx.core.storage import is_url, state
 
 log = logging.getLogger(__name__)
@@ -34,6 +35,131 @@ LOCK = ".lock"
 
 _DATED = re.compile(r"\$\{\s*now\s*:")
 """A configured folder that holds the time: no two sweeps share it."""
+
+
+STATUS = "outcome.json"
+"""The marker in a job's folder; written whole and last."""
+
+RECORD = "sweep.json"
+"""Says in a sweep's folder what the sweep is."""
+
+R = TypeVar("R")
+
+
+def _read(kind: Callable[..., R], path: Path, words: str) -> R | None:
+    """Returns a record, whose tuple is called `words`; None if there is none that can be read."""
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        return kind(**{**values, words: tuple(values[words])})
+    except (OSError, ValueError, TypeError, KeyError):
+        return None
+
+
+@dataclass(frozen=True)
+class JobStatus:
+    """How a job of a sweep ended.
+
+    Attributes:
+        code: exit code: 0; 2 for a user's mistake; 1 for a bug.
+        message: one sentence for people; empty if all went well.
+        detail: the traceback of a bug.
+        overrides: what was asked for.
+        multirun: the start of the sweep that last saw this job.
+        command: the sweep's command, see `Record.command_hash`.
+        fingerprint: of everything that the results depend on, see `fingerprint`.
+        number: the job's place in the sweep.
+        seconds: how long it took, s.
+        before: an earlier start of the sweep did it.
+    """
+
+    code: int
+    message: str
+    detail: str
+    overrides: tuple[str, ...]
+    multirun: str = ""
+    command: str = ""
+    fingerprint: str = ""
+    number: int = 0
+    seconds: float = 0.0
+    before: bool = False
+
+    @classmethod
+    def read(cls, folder: Path) -> JobStatus | None:
+        """Returns how the job in `folder` ended; None if it left no marker that can be read."""
+        return _read(cls, folder / STATUS, "overrides")
+
+    def write(self, folder: Path) -> None:
+        """Writes it, whole, into the job's folder."""
+        write_json(folder / STATUS, asdict(self))
+
+    @property
+    def state(self) -> str:
+        """For people: done, done before or failed."""
+        if self.code:
+            return "failed"
+        return "done before" if self.before else "done"
+
+
+def metrics_of(folder: Path) -> dict[str, float]:
+    """Returns the finite metrics of a finished job; empty if there are none."""
+    from cfx.core.job_folder import read_metrics
+
+    try:
+        found = read_metrics(folder / "metrics.json")
+    except DataError:
+        return {}
+    return {name: value for name, value in found.items() if math.isfinite(value)}
+
+
+@dataclass(frozen=True)
+class Record:
+    """What `sweep.json` says.
+
+    Attributes:
+        name: what the jobs share in MLflow; it stays when the sweep is continued from elsewhere.
+        command: the overrides, as typed.
+        command_hash: the same for the same overrides and values in any order.
+        started: ISO 8601.
+        jobs: how many there are, None if the sweeper decides as it goes.
+        completed: ISO 8601; empty while jobs are missing or failed.
+    """
+
+    name: str
+    command: tuple[str, ...]
+    command_hash: str
+    started: str
+    jobs: int | None = None
+    completed: str = ""
+
+    @classmethod
+    def read(cls, folder: Path) -> Record | None:
+        """Returns the record in a sweep's folder; None if there is none that can be read."""
+        return _read(cls, folder / RECORD, "command")
+
+    def write(self, folder: Path) -> None:
+        """Writes it, whole, into the sweep's folder."""
+        write_json(folder / RECORD, asdict(self))
+
+    def statuses(self, folder: Path, multirun: str) -> dict[Path, JobStatus]:
+        """Returns how the jobs ended that this start has seen or that were done before.
+
+        They stand by their folders, in the sweep's order.
+        """
+        found: dict[Path, JobStatus] = {}
+        for marker in sorted(folder.rglob(STATUS)):
+            job = marker.parent
+            inside = job.relative_to(folder)
+            between = (inside, *inside.parents)[:-1]
+            if any((folder / place / RECORD).exists() for place in between):
+                continue  # of another sweep below this one
+            status = JobStatus.read(job)
+            if status is None:
+                continue
+            if status.multirun == multirun:
+                found[job] = status
+            elif status.code == 0 and status.command == self.command_hash:
+                found[job] = replace(status, before=True)
+        return dict(sorted(found.items(), key=lambda item: item[1].number))
 
 
 @contextlib.contextmanager
@@ -62,8 +188,7 @@ def find_folder(
     Args:
         configured: the folder as it stands in the configuration, with its interpolations.
         wanted: the same, resolved.
-        command_hash: see `Record.command_hash`.
-        resumable: the folders of its jobs are named by what the jobs are.
+        command_hash, resumable: as of `Record` and `Sweep`.
 
     Raises:
         ConfigError: another sweep uses the folder that was asked for.
@@ -75,18 +200,19 @@ def find_folder(
         found = _incomplete_folder(_pattern(configured), command_hash)
         if found is not None:
             return found
-    return _new_folder(wanted)
+    while True:
+        folder = new_folder(wanted)
+        lock = _try_lock(folder)
+        if lock is not None:
+            return folder, lock
 
 
 def _pattern(folder: str) -> str:
     """Returns the glob of a configured folder: what is interpolated may be anything."""
-    text = folder
-    while True:
-        shorter = re.sub(r"\$\{[^${}]*\}", "\0", text)  # innermost interpolations first
-        if shorter == text:
-            break
-        text = shorter
-    return "*".join(glob.escape(part) for part in text.split("\0"))
+    replaced = 1
+    while replaced:  # innermost interpolations first
+        folder, replaced = re.subn(r"\$\{[^${}]*\}", "\0", folder)
+    return "*".join(glob.escape(part) for part in folder.split("\0"))
 
 
 def _incomplete_folder(pattern: str, command_hash: str) -> tuple[Path, BaseFileLock] | None:
@@ -111,18 +237,23 @@ def _incomplete_folder(pattern: str, command_hash: str) -> tuple[Path, BaseFileL
     return None
 
 
-def _new_folder(wanted: Path) -> tuple[Path, BaseFileLock]:
-    """Returns a new folder, locked."""
-    folder = wanted
-    number = 1
+def new_folder(wanted: Path) -> Path:
+    """Makes a folder that did not exist before; returns it, numbered where its name was taken.
+
+    Raises:
+        OSError: it cannot be made, or a file has its name.
+    """
+    folder, number = wanted, 1
     while True:
-        with contextlib.suppress(FileExistsError):
+        try:
             folder.mkdir(parents=True)
-            lock = _try_lock(folder)
-            if lock is not None:
-                return folder, lock
-        number += 1
-        folder = wanted.with_name(f"{wanted.name}-{number}")
+        except FileExistsError:
+            if not wanted.is_dir():
+                raise
+            number += 1
+            folder = wanted.with_name(f"{wanted.name}-{number}")
+        else:
+            return folder
 
 
 def _named_folder(folder: Path, *, resumable: bool) -> tuple[Path, BaseFileLock]:
@@ -159,23 +290,14 @@ def fingerprint(values: Mapping[str, Any]) -> str:
 
     It covers the configuration, the versions of cfx and of plugins, and the state of the data file.
 
-    Args:
-        values: the job's resolved configuration.
-
     Raises:
         PluginError: a component that is named is not there.
     """
     from cfx.results import provenance
 
-    parts = {
-        "config": values,
-        "cfx": provenance.version(),
-        "plugins": {
-            **provenance.distributions(values),
-            **provenance.metric_distributions(values),
-        },
-        "data": _state_of_data(values.get("data")),
-    }
+    plugins = provenance.distributions(values) | provenance.metric_distributions(values)
+    data = _state_of_data(values.get("data"))
+    parts = {"config": values, "cfx": provenance.version(), "plugins": plugins, "data": data}
     return content_key(parts)
 
 
@@ -185,10 +307,7 @@ def job_name(_root_: Any) -> str:
     It is the same for the same overrides in any order.
     """
     task: Any = OmegaConf.to_container(_root_.hydra.overrides.task, resolve=False)
-    given = {}
-    for override in task:
-        key = override.partition("=")[0]
-        given[key] = override  # where a key is given twice the last one counts
+    given = {one.partition("=")[0]: one for one in task}  # of a key given twice the last one counts
     return content_key([sorted(given.values()), *_sources(_root_)])[:8]
 
 
@@ -201,11 +320,8 @@ def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
     """
     typed: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
     sweeper: Any = OmegaConf.to_container(config.hydra.sweeper, resolve=False)
-    asked = []
-    for key, value in (sweeper.pop("params", None) or {}).items():
-        asked.append(f"{key}={value}")
-    asked += typed["task"]
-
+    params = (sweeper.pop("params", None) or {}).items()
+    asked = [*(f"{key}={value}" for key, value in params), *typed["task"]]
     values: dict[str, list[str]] = {}
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
     for override in parser.parse_overrides(asked):
@@ -253,10 +369,8 @@ def _state_of_data(node: Any) -> list[list[Any]] | None:
 
 def _sources(config: Any) -> tuple[Any, ...]:
     """Returns what else decides what the overrides mean: --config-name and --config-dir."""
-    given = []
-    for source in config.hydra.runtime.config_sources:
-        if source.provider == "command-line":
-            given.append(str(source.path))
+    sources = config.hydra.runtime.config_sources
+    given = [str(source.path) for source in sources if source.provider == "command-line"]
     return str(config.hydra.job.config_name), given
 
 

@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfx.app.sweep.record import JobStatus, metrics_of
+from cfx.app.sweep.folder import JobStatus, metrics_of
 from cfx.core.console import blank_table
 from cfx.core.errors import DataError
 from cfx.core.files import atomic_write
@@ -51,11 +51,6 @@ def metric_columns(folders: Sequence[Path]) -> list[MetricInfo]:
     return list(found.values())
 
 
-def _column(metric: MetricInfo, judged: str) -> str:
-    """Returns the column of `summary.csv` with a metric of the method that jobs are judged by."""
-    return f"{metric.name}_{judged}"
-
-
 def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
     """Returns a row per job of the summary.
 
@@ -69,7 +64,9 @@ def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
     measured = []
     for folder, status in statuses.items():
         measured.append({} if status.code else metrics_of(folder))
-    judged = "fixed" if _are_calibrations(measured) else "policy"
+    adapts = any("rmse_speed/policy" in found for found in measured)
+    are_calibrations = not adapts and any("rmse_speed/fixed" in found for found in measured)
+    judged = "fixed" if are_calibrations else "policy"
     table = []
     for (folder, status), own, found in zip(statuses.items(), given, measured, strict=True):
         row: dict[str, Any] = {"folder": folder.name}
@@ -81,19 +78,12 @@ def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
             if method != "policy" or judged == "policy":
                 row[f"rmse_speed_{method}"] = found.get(f"rmse_speed/{method}")
         for column in columns:
-            row[_column(column, judged)] = found.get(f"{column.name}/{judged}")
+            row[f"{column.name}_{judged}"] = found.get(f"{column.name}/{judged}")
         row["seconds"] = round(status.seconds, 1)
         row["state"] = status.state
         row["message"] = status.message
         table.append(row)
     return table
-
-
-def _are_calibrations(measured: Sequence[Mapping[str, float]]) -> bool:
-    """Says whether no job has a policy that adapts, and one at least is a calibration."""
-    if any("rmse_speed/policy" in found for found in measured):
-        return False
-    return any("rmse_speed/fixed" in found for found in measured)
 
 
 def errors_of(statuses: Mapping[Path, JobStatus]) -> dict[str, pd.DataFrame]:
@@ -144,10 +134,9 @@ def summary_table(table: Sequence[Mapping[str, Any]], columns: Sequence[MetricIn
     overrides = first[1:end]
     adapts = _OVER in first
     over = {row[_OVER] for row in table if adapts} - {""}
-    methods = []
-    for method in _SHOWN:
-        if any(row.get(f"rmse_speed_{method}") is not None for row in table):
-            methods.append(method)
+    methods = [
+        one for one in _SHOWN if any(row.get(f"rmse_speed_{one}") is not None for row in table)
+    ]
     judged = "policy" if adapts else "fixed"
     headlines = [column for column in columns if column.headline]
     shown = blank_table(*(overrides or ["job"]), title="The sweep")
@@ -170,7 +159,7 @@ def summary_table(table: Sequence[Mapping[str, Any]], columns: Sequence[MetricIn
         for method in methods:
             cells.append(_number(row[f"rmse_speed_{method}"]))
         for column in headlines:
-            cells.append(_number(row[_column(column, judged)]))
+            cells.append(_number(row[f"{column.name}_{judged}"]))
         shown.add_row(*cells, f"{row['seconds']:.1f}", row["state"])
     return shown
 
@@ -182,23 +171,13 @@ def _in_words(over: str) -> str:
 
 
 def _as_mapping(overrides: Sequence[str]) -> dict[str, str]:
-    found = {}
-    for one in overrides:
-        key, _, value = one.partition("=")
-        found[key] = value
-    return found
+    return {key: value for key, _, value in (one.partition("=") for one in overrides)}
 
 
 def _differing(given: Sequence[Mapping[str, str]]) -> list[str]:
     """Returns the keys in which the jobs differ; all if they differ in none."""
-    keys: dict[str, set[str | None]] = {}
-    for one in given:
-        for key in one:
-            keys.setdefault(key, set())
-    for one in given:
-        for key, values in keys.items():
-            values.add(one.get(key))
-    return [key for key, values in keys.items() if len(values) > 1] or list(keys)
+    keys = dict.fromkeys(key for one in given for key in one)
+    return [key for key in keys if len({one.get(key) for one in given}) > 1] or list(keys)
 
 
 def _improvement(found: Mapping[str, float]) -> dict[str, Any]:
@@ -236,6 +215,4 @@ def _improvement_said(row: Mapping[str, Any], *, named: bool) -> str:
 
 
 def _number(value: float | None) -> str:
-    if value is None:
-        return ""
-    return f"{value:.3f}"
+    return "" if value is None else f"{value:.3f}"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfx.core.errors import TrackingError
-from cfx.results.tracker import Origin, TrackedJob, Tracker, Tracking
+from cfx.results.tracker import Origin, Tracker, Tracking
 from cfx_mlflow import store
 
 if TYPE_CHECKING:
@@ -42,12 +42,12 @@ class MlflowTracking(Tracking):
     def folder_of_run(self, run_id: str, uri: str | None = None) -> Path:
         return store.download_run(run_id, uri)
 
-    def jobs_of_run(self, run_id: str) -> list[TrackedJob]:
+    def jobs_of_run(self, run_id: str) -> list[Origin]:
         uri = store.tracking_uri(None)
         file = store.sqlite_file(uri)
         if not store.is_run_id(run_id) or (file is not None and not file.is_file()):
             # It says what is wrong with the id or the store.
-            return [TrackedJob(Origin(run_id), store.download_run(run_id))]
+            return [Origin(run_id, store.download_run(run_id))]
         opened = store.open_store(uri, "cfx")
         with store.translate_errors(f"read run {run_id} from {uri}"):
             run = opened.client.get_run(run_id)
@@ -62,20 +62,20 @@ class MlflowTracking(Tracking):
         return [_tracked(job) for job in sorted(jobs, key=lambda job: job.info.start_time or 0)]
 
 
-def _tracked(run: Any) -> TrackedJob:
+def _tracked(run: Any) -> Origin:
     tags, info = run.data.tags, run.info
     place = f"MLflow run {info.run_id}"
     if info.status != "FINISHED":
         reason = tags.get("cfx.failure") or f"not finished: MLflow says {info.status}"
-        return TrackedJob(Origin(place), reason=reason)
+        return Origin(place, reason=reason)
     # Where the job ran on this machine, its folder tells what was typed; MLflow does not keep that.
     there = Path(tags.get("cfx.folder", ""))
     is_there = tags.get("cfx.folder") and (there / "metrics.json").is_file()
-    origin = Origin(
+    return Origin(
         place,
+        store.download_run(info.run_id),
         started=datetime.fromtimestamp(info.start_time / 1000),
         seconds=(info.end_time - info.start_time) / 1000 if info.end_time else None,
         version=tags.get("cfx.version", ""),
         hydra=there if is_there else None,
     )
-    return TrackedJob(origin, store.download_run(info.run_id))

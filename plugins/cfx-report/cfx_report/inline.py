@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from cfx.figures.canvas import WIDTH, figure_style, hover_text
-from cfx.figures.write import METADATA
+from cfx.figures.figure import METADATA
 
 _MANY_POINTS = 400
 """A cloud of more points is a picture inside a page's SVG: each point would be an element."""

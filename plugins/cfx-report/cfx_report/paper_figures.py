@@ -103,8 +103,8 @@ def draw(
     """
     from cfx.core.registry import installed
     from cfx.figures.canvas import Paper, on_paper
+    from cfx.figures.figure import write_figures
     from cfx.figures.text import plural
-    from cfx.figures.write import write_figures
     from cfx_report.runs import read_runs
 
     known = sorted(one.name for one in installed("figure"))
@@ -128,7 +128,7 @@ def draw(
 def _compared(jobs: Sequence[Job], folder: Path, formats: Sequence[str]) -> list[str]:
     """Draws jobs against the one that is closest to the drivers; returns what to tell the user."""
     from cfx.evaluation.statistics import against_the_best, verdict
-    from cfx.figures.write import write_figure
+    from cfx.figures.figure import write_figure
     from cfx_report.figures.models import draw_models
 
     errors = {job.name: job.errors for job in jobs}

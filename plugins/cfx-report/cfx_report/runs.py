@@ -22,22 +22,6 @@ from cfx.results.tracker import Origin, tracking_of_run
 from cfx_report.jobs import Runs, Unfinished
 from cfx_report.names import named
 
-
-def tracked_runs(run_id: str) -> list[tuple[Path, Origin] | Unfinished]:
-    """Returns folder and origin of a tracked job; of a sweep's run, those of each of its jobs.
-
-    Raises:
-        TrackingError: there is no such run, or its files are gone.
-    """
-    found: list[tuple[Path, Origin] | Unfinished] = []
-    for job in tracking_of_run(run_id).jobs_of_run(run_id):
-        if job.folder is None:
-            found.append(Unfinished(job.origin.place, job.reason))
-        else:
-            found.append((job.folder, job.origin))
-    return found
-
-
 _PASSED_OVER = {".hydra", "mlartifacts", "figures", "policy", "cache"}
 """Folders below an output folder that hold no jobs of their own."""
 
@@ -108,8 +92,8 @@ def _of_folder(folder: Path, place: Callable[[Path], str]) -> list[Job | Unfinis
 
 def _of_mlflow(run: str) -> list[Job | Unfinished]:
     found: list[Job | Unfinished] = []
-    for one in tracked_runs(run):
-        found.append(one if isinstance(one, Unfinished) else read_job(*one))
+    for one in tracking_of_run(run).jobs_of_run(run):
+        found.append(Unfinished(one.place, one.reason) if one.folder is None else read_job(one))
     if not any(isinstance(one, Job) for one in found):
         raise DataError(f"run {run} holds no finished job{_reasons(found)}")
     return found
@@ -135,7 +119,7 @@ def _job_folders(folder: Path) -> Iterator[Path]:
 
 def _one(folder: Path, place: str) -> Job | Unfinished:
     if (folder / "metrics.json").is_file():
-        return read_job(folder, Origin(place))
+        return read_job(Origin(place, folder))
     status = optional(folder / "outcome.json", read_json) or {}
     if status.get("code"):
         return Unfinished(place, f"failed: {without_password(str(status.get('message', '')))}")

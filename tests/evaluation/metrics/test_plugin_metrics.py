@@ -14,7 +14,7 @@ from rich.console import Console
 
 import cfx
 from cfx.app.job.console import methods_table
-from cfx.app.sweep.record import JobStatus
+from cfx.app.sweep.folder import JobStatus
 from cfx.app.sweep.summary import metric_columns, rows, summary_table, write_summary
 from cfx.core.errors import PluginError
 from cfx.evaluation.metrics.base import ALWAYS, MetricSet
@@ -92,8 +92,10 @@ def test_a_plugins_metric_stands_in_every_result(
 
 
 def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> None:
-    info = {"name": "mean_gap", "unit": "m", "heading": "mean gap", "headline": True}
-    hidden = {"name": "theil_u", "unit": "", "heading": "Theil's U", "headline": False}
+    usual = {"direction": "none", "summary": "mean", "meaning": "", "scopes": ["test"]}
+    usual["distribution"] = "theirs"
+    info = {**usual, "name": "mean_gap", "unit": "m", "heading": "mean gap", "headline": True}
+    hidden = {**usual, "name": "theil_u", "unit": "", "heading": "Theil's U", "headline": False}
     statuses = {}
     for name, value in {"a": 12.5, "b": 13.5}.items():
         folder = tmp_path / name

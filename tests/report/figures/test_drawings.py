@@ -16,9 +16,8 @@ from matplotlib.image import imread
 from cfx.core.errors import ConfigError, OutputError
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.evaluation.result import Evaluation, Purpose
-from cfx.figures.figure import Results, draw, figure_named
+from cfx.figures.figure import Results, draw, figure_named, write_figure, write_figures
 from cfx.figures.text import COLOURS, percent, pretty_unit, short, unit_label
-from cfx.figures.write import write_figure, write_figures
 from cfx.learners.curves import over_networks
 from cfx_forecasts.figures import errors_over_time
 from cfx_report.figures.improvements import amounts_of

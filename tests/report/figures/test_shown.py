@@ -65,7 +65,7 @@ def make_panels(far: float = 0.0) -> tuple[Evaluation, PairPanels]:
     gap["default"] = gap["default"] + np.linspace(0, far, 31)
     gap["policy"] = trajectory.real_gap - np.linspace(0, 40, 31)
     trajectory = dataclasses.replace(trajectory, gap=gap)
-    axes = parameter_axes(evaluation)
+    axes = parameter_axes(evaluation.parameters)
     return evaluation, pair_panels(trajectory, evaluation.methods, axes)
 
 
@@ -94,7 +94,7 @@ def test_parameters_have_their_limits_and_say_what_they_mean() -> None:
         for one, meaning in zip(evaluation.parameters, meanings, strict=True)
     ]
     evaluation = dataclasses.replace(evaluation, parameters=tuple(parameters))
-    axes = parameter_axes(evaluation)
+    axes = parameter_axes(evaluation.parameters)
     panels = pair_panels(evaluation.trajectories[0], evaluation.methods, axes)
     alone = draw_parameters(panels, evaluation.methods).axes[1:]
     of_pair = draw_pair(Results.of(evaluation), panels.pair_id).axes[2:]
@@ -107,7 +107,7 @@ def test_parameters_have_their_limits_and_say_what_they_mean() -> None:
 def test_a_hidden_method_is_left_out() -> None:
     methods = ("default", "fixed", "shrunk", "policy")
     evaluation = make_results(pairs=1, frames=30, methods=methods).evaluation
-    panels = pair_panels(evaluation.trajectories[0], methods, parameter_axes(evaluation))
+    panels = pair_panels(evaluation.trajectories[0], methods, parameter_axes(evaluation.parameters))
     figure = draw_pairs([("", "", "")], [panels], methods)
     assert colour_of("shrunk") not in drawn_lines(figure.axes[0])
 
@@ -241,8 +241,8 @@ def test_calibrated_parameters_have_their_places_and_correlations() -> None:
     evaluation = make_results(
         pairs=9, frames=20, methods=("default", "population", "fixed")
     ).evaluation
-    spreads = parameter_spreads(evaluation.table, parameter_axes(evaluation))
-    table = correlations(evaluation.table, parameter_axes(evaluation))
+    spreads = parameter_spreads(evaluation.table, parameter_axes(evaluation.parameters))
+    table = correlations(evaluation.table, parameter_axes(evaluation.parameters))
     drawn, image = draw_calibration(spreads, table).axes[:2]
     places = []
     for line in drawn.lines:

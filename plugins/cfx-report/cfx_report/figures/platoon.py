@@ -20,9 +20,10 @@ from cfx.figures.canvas import (
     points,
     side_by_side,
     styled,
+    vehicle_colour,
 )
 from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import COLLISION_COLOUR, COLOURS, label, number, vehicle_colour
+from cfx.figures.text import COLLISION_COLOUR, COLOURS, label, number
 
 TIME_TITLE = "time from the braking of the leader (s)"
 

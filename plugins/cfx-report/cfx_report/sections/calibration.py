@@ -88,12 +88,12 @@ def slices_of(job: Job) -> tuple[SlicePanel, ...]:
     """Returns the loss along each tuned parameter of a job; () if it has kept none."""
     if "slices" not in job.tables:
         return ()
-    return slice_panels(job.tables["slices"], job.described_parameters)
+    return slice_panels(job.tables["slices"], job.parameters)
 
 
 def spreads_of(job: Job) -> tuple[ParameterSpread, ...]:
     """Returns the spread of each tuned parameter of a job."""
-    return parameter_spreads(job.pairs, job.described_parameters)
+    return parameter_spreads(job.pairs, job.parameters)
 
 
 def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:

@@ -13,9 +13,8 @@ from matplotlib.transforms import Affine2D
 
 from cfx.evaluation.result import Evaluation
 from cfx.figures.canvas import canvas, styled
-from cfx.figures.figure import Results
+from cfx.figures.figure import Results, write_figure
 from cfx.figures.text import COLOURS, INK, label, short
-from cfx.figures.write import write_figure
 from cfx_report.figures.trajectories import drives
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
