@@ -37,6 +37,7 @@ QUICK: dict[str, Any] = {
     "steps": 10,
     "learning_rate": 0.01,
     "horizon": 12,
+    "burn_in_s": 2.0,
     "compile": "never",
 }
 COMPILED = QUICK | {"compile": "never" if compiler.find_compiler() is None else "always"}

@@ -27,7 +27,7 @@ from tests.drives import wavy_pairs
 from tests.learners.made import ready
 
 SETTINGS = WindowSettings()
-QUICK = {"epochs": 30, "learning_rate": 0.02}
+QUICK = {"epochs": 12, "learning_rate": 0.02}
 TRUE = torch.tensor([[1.5, 0.1], [2.0, 0.3], [2.5, 0.5], [1.0, 0.0]]).double()
 
 
@@ -88,7 +88,7 @@ def test_contract_with_offsets() -> None:
 
 @pytest.mark.parametrize("head", ["direct", "offset"])
 def test_it_learns_what_can_be_learned(head: str) -> None:
-    learner = ImitationLearner(epochs=80, learning_rate=0.02, patience=None, head=head)
+    learner = ImitationLearner(epochs=40, learning_rate=0.03, patience=None, head=head)
     result = learner.fit(GruPolicy(), training_data())
     curve = result.curves.groupby("epoch")[["train_loss", "validation_loss"]].mean()
     assert curve.train_loss.iloc[-1] < 0.05 * curve.train_loss.iloc[0]

@@ -35,6 +35,9 @@ from tests.learners.made import (
 )
 
 
+SHORT = QUICK | {"epochs": 3, "steps": 5, "horizon": 6, "learning_rate": 0.02}
+
+
 def assert_same_weights(one: TrainingResult, two: TrainingResult) -> None:
     for a, b in zip(one.network.parameters(), two.network.parameters(), strict=True):
         assert torch.equal(a, b)
@@ -113,8 +116,8 @@ def test_driver_features_help_to_drive_more_like_each_driver() -> None:
 def test_training_goes_on_where_it_was_interrupted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy, whole = gru(dropout=0.1), training_data(workspace=tmp_path / "whole")
-    learner = RolloutLearner(**(QUICK | {"ensemble_size": 2, "steps": 4}))
+    policy, whole = gru(dropout=0.1), training_data(frames=150, workspace=tmp_path / "whole")
+    learner = RolloutLearner(**(SHORT | {"epochs": 6, "ensemble_size": 2}))
     expected = learner.fit(policy, whole)
     broken = replace(whole, workspace=tmp_path / "broken")
     judge, epochs = RolloutModule.judge, []
@@ -141,8 +144,8 @@ def test_training_goes_on_where_it_was_interrupted(
 def test_neither_experts_nor_their_students_train_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy, whole = gru(), training_data(networks=1, workspace=tmp_path / "whole")
-    learner = RolloutLearner(**(QUICK | {"epochs": 4, "distillation_epochs": 2, "steps": 4}))
+    policy, whole = gru(), training_data(networks=1, frames=150, workspace=tmp_path / "whole")
+    learner = RolloutLearner(**(SHORT | {"epochs": 4, "distillation_epochs": 2}))
     expected = learner.fit(policy, whole)
     broken = replace(whole, workspace=tmp_path / "broken")
     judge, epochs = RolloutModule.judge, []
@@ -219,8 +222,8 @@ def test_an_ensemble_learns_and_drives_as_one() -> None:
     ids=lambda options: next(iter(options)),
 )
 def test_every_option_trains(options: dict[str, Any]) -> None:
-    policy, data = gru(), training_data(networks=1, base=TRUE * 1.3)
-    result = RolloutLearner(**(QUICK | {"epochs": 3, "steps": 8} | options)).fit(policy, data)
+    policy, data = gru(), training_data(networks=1, frames=150, base=TRUE * 1.3)
+    result = RolloutLearner(**(SHORT | options)).fit(policy, data)
     # The training loss of a stochastic head counts other terms from half of the epochs on.
     measure = "validation_loss" if options.get("head") == "stochastic" else "train_loss"
     curve = result.curves.groupby("epoch")[measure].mean()
@@ -253,7 +256,7 @@ def test_compiled_training_is_eager_training() -> None:
 
 def test_patience_begins_after_distillation() -> None:
     """Nothing gets better: four epochs are distillation, and two more are waited for."""
-    policy, data = gru(), training_data(networks=1)
+    policy, data = gru(), training_data(networks=1, frames=150)
     still = {"steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0}
     options = QUICK | still | {"epochs": 8, "distillation_epochs": 4, "patience": 2}
     curves = RolloutLearner(**options).fit(policy, data).curves

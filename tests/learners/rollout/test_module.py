@@ -30,11 +30,18 @@ from tests.learners.made import (
 )
 
 
+FEATURES = ("time_headway", "acceleration")
+
+
 @pytest.mark.parametrize(
-    "driver_features", [(), ("time_headway", "acceleration")], ids=["", "driver_features"]
+    ("model", "head", "driver_features"),
+    [
+        (Krauss(), "offset", ()),
+        (Krauss(), "residual", FEATURES),
+        (W99(), "offset", FEATURES),
+        (W99(), "residual", ()),
+    ],
 )
-@pytest.mark.parametrize("head", ["offset", "residual"])
-@pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
 def test_training_simulates_what_evaluation_simulates(
     model: Any, head: str, driver_features: tuple[str, ...]
 ) -> None:
@@ -233,8 +240,11 @@ def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full:
     return next(module.trajectory_losses(module.exact_step, batch, windows, divisors))
 
 
-@pytest.mark.parametrize("cold_start_fraction", [0.0, 0.4, 1.0])
-@pytest.mark.parametrize("second", ["aabcde", "aabbcc"], ids=["enough drivers", "few drivers"])
+@pytest.mark.parametrize(
+    ("cold_start_fraction", "second"),
+    [(0.0, "aabbcc"), (0.4, "aabcde"), (1.0, "aabcde"), (1.0, "aabbcc")],
+    ids=["few drivers with history", "both", "cold starts", "few drivers"],
+)
 def test_the_validation_loss_is_the_mean_over_validation_drivers(
     cold_start_fraction: float, second: str
 ) -> None:

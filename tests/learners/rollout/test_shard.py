@@ -20,7 +20,7 @@ from cfx.learners.rollout.shard import networks_of_shards
 from tests.learners.made import QUICK, TRUE, gru, placed, training_data
 from tests.scripts import run_script
 
-SHORT = QUICK | {"ensemble_size": 2, "epochs": 3, "steps": 3, "horizon": 6}
+SHORT = QUICK | {"ensemble_size": 2, "epochs": 2, "steps": 2, "horizon": 6}
 
 
 class Recorded(Engine):

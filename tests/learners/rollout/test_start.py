@@ -16,7 +16,7 @@ from cfx.models.w99 import W99
 from cfx.policies.checkpoint import save
 from cfx.policies.core import ALL
 from cfx.simulation.windows import WindowSettings
-from tests.learners.made import QUICK, gru, loop, ready, training_data
+from tests.learners.made import COMPILED, QUICK, gru, loop, ready, training_data
 
 STILL = QUICK | {"epochs": 1, "steps": 1, "learning_rate": 1e-12, "weight_decay": 0.0}
 
@@ -24,7 +24,7 @@ STILL = QUICK | {"epochs": 1, "steps": 1, "learning_rate": 1e-12, "weight_decay"
 def learned(folder: Path, ensemble_size: int = 2) -> TrainingResult:
     """Trains one network on the drivers and saves it as a job does."""
     data = training_data(networks=1)
-    options = QUICK | {"ensemble_size": ensemble_size}
+    options = COMPILED | {"epochs": 3, "steps": 6, "ensemble_size": ensemble_size}
     result = RolloutLearner(**options).fit(gru(), data)
     agent = ready(result, data, gru())
     node = {"name": "krauss"}
