@@ -27,33 +27,6 @@ from cfx.policies.heads.base import ParameterHead
 from cfx.simulation.kernel.compiler import torch_compiled
 
 
-class _Rows(NamedTuple):
-    """The R trajectories that networks learn from: one for each pair and base.
-
-    Attributes:
-        pair: `(R,)`.
-        network: `(R,)`.
-        base: in unit space, `(R, n)`, single precision.
-    """
-
-    pair: Tensor
-    network: Tensor
-    base: Tensor
-
-
-def _rows(training_data: TrainingData, head: ParameterHead) -> _Rows:
-    """Returns each pair with its base, and with the pooled one where that is another."""
-    device = training_data.device
-    pair = torch.arange(len(training_data.pairs), device=device)
-    network = training_data.pairs.network.to(device)
-    pooled, own = training_data.pairs.fixed, training_data.pairs.base
-    unit_pooled = head.space.to_unit(pooled).float()
-    if own is None or not head.needs_base or torch.equal(own, pooled):
-        return _Rows(pair, network, unit_pooled)
-    unit_own = head.space.to_unit(own).float()
-    return _Rows(pair.repeat(2), network.repeat(2), torch.cat([unit_own, unit_pooled]))
-
-
 class ImitationDataset(NamedTuple):
     """Training tensors as N networks by B trajectories by W windows.
 
@@ -116,18 +89,24 @@ class ImitationDataset(NamedTuple):
         weight = torch.ones_like(sensitivity)
         if weighs:
             weight = _sensitivity_weight(sensitivity, train)
-        rows = _rows(training_data, head)
-        grid = Grid(rows.network, len(training_data.names))
-        conditioning = head.condition(rows.base)[:, None].expand(-1, mask.shape[1], -1)
-        features = grid.scatter(torch.cat([tokens_of_pairs[rows.pair], conditioning], -1))
-        scaler = Scaler.of(features, grid.scatter(train[rows.pair]))
+        # Each pair is learned from with its base, and with the pooled one where that is another.
+        rows, network = torch.arange(pairs, device=device), training_data.pairs.network.to(device)
+        pooled, own = training_data.pairs.fixed, training_data.pairs.base
+        base = head.space.to_unit(pooled).float()
+        if own is not None and head.needs_base and not torch.equal(own, pooled):
+            rows, network = rows.repeat(2), network.repeat(2)
+            base = torch.cat([head.space.to_unit(own).float(), base])
+        grid = Grid(network, len(training_data.names))
+        conditioning = head.condition(base)[:, None].expand(-1, mask.shape[1], -1)
+        features = grid.scatter(torch.cat([tokens_of_pairs[rows], conditioning], -1))
+        scaler = Scaler.of(features, grid.scatter(train[rows]))
         return cls(
             scaler=scaler,
             features=scaler(features),
-            labels=grid.scatter(labels_of_pairs[rows.pair]),
-            base=grid.scatter(rows.base),
-            train_weight=grid.scatter((weight * train)[rows.pair]),
-            validation_weight=grid.scatter((weight * (mask & ~train))[rows.pair]),
+            labels=grid.scatter(labels_of_pairs[rows]),
+            base=grid.scatter(base),
+            train_weight=grid.scatter((weight * train)[rows]),
+            validation_weight=grid.scatter((weight * (mask & ~train))[rows]),
         )
 
 

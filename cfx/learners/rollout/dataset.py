@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -568,22 +569,23 @@ def _scaler(
     """
     windows = seen.shape[1]
     known = driver_features.isnan().logical_not().all(-1)
+
+    def of_base(number: int) -> _Values:
+        for part in _parts(pair.shape[1]):
+            own = pair[number, part]
+            center = squashed(base[number, part])[:, None].expand(-1, windows, -1)
+            yield torch.cat([seen[own], center], -1)[None], counted[number, part][None]
+            scratch.release()
+
+    def of_driver(number: int) -> _Values:
+        for part in _parts(pair.shape[1]):
+            own = pair[number, part]
+            values = driver_features[own].nan_to_num()[:, None].expand(-1, windows, -1)
+            yield values[None], (counted[number, part] & known[own][:, None])[None]
+
     means, scales = [], []
-    for number, own in enumerate(pair):
-
-        def of_base(number: int = number, own: Tensor = own) -> _Values:
-            for part in _parts(len(own)):
-                center = squashed(base[number, part])[:, None].expand(-1, windows, -1)
-                values = torch.cat([seen[own[part]], center], -1)
-                yield values[None], counted[number, part][None]
-                scratch.release()
-
-        def of_driver(number: int = number, own: Tensor = own) -> _Values:
-            for part in _parts(len(own)):
-                values = driver_features[own[part]].nan_to_num()[:, None].expand(-1, windows, -1)
-                yield values[None], (counted[number, part] & known[own[part]][:, None])[None]
-
-        found = Scaler.of_parts(of_base), Scaler.of_parts(of_driver)
+    for number in range(len(pair)):
+        found = [Scaler.of_parts(partial(of, number)) for of in (of_base, of_driver)]
         means.append(torch.cat([one.mean for one in found], -1))
         scales.append(torch.cat([one.scale for one in found], -1))
     return Scaler(torch.cat(means), torch.cat(scales))

@@ -29,7 +29,7 @@ from cfx.core.progress import Task
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult, learned_range
 from cfx.learners.curves import warn_of_nothing_learned
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
-from cfx.learners.rollout.sampling import Augmentation
+from cfx.learners.rollout.sampling import augmentation
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import (
     TrainedShard,
@@ -128,7 +128,7 @@ class RolloutLearner(Learner):
         augment = None
         if training_data.pairs.base is not None and s.cold_start_fraction > 0:
             generator = torch.Generator().manual_seed(training_data.seed)
-            augment = Augmentation(s, time_gaps(training_data), generator)
+            augment = augmentation(s, time_gaps(training_data), generator)
         valid_range = learned_range(training_data, augment)
         if start is not None and start.valid_range is not None:
             valid_range = valid_range.joined(start.valid_range)

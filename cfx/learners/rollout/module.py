@@ -364,7 +364,8 @@ class RolloutModule(BatchedModule):
     def _loss_with_history(self) -> Tensor:
         """Returns the loss over the horizon, `(N,)`."""
         batch = self.sampler.validation_with_history()
-        return self._exact_loss(batch, self.settings.horizon, self.shard.errors.over_horizon(batch))
+        divisors = self.shard.errors.over_horizon(batch)
+        return self._exact_loss(batch, self.settings.horizon, divisors)
 
     def _loss_of_cold_starts(self) -> Tensor:
         """Returns the loss of full trajectories, `(N,)`; NaN for networks that keep none."""
@@ -375,9 +376,11 @@ class RolloutModule(BatchedModule):
         return self._exact_loss(batch, windows, self.shard.errors.over_full_trajectory(batch))
 
     def _exact_loss(self, batch: RolloutBatch, windows: int, divisors: Divisors) -> Tensor:
+        """Returns the weighted mean over trajectories, `(N,)`; NaN where nothing has weight."""
         self._noise_of = 0
         losses = self.trajectory_losses(self.exact_step, batch, windows, divisors)
-        return _weighted_mean(next(losses), batch.weight)
+        loss = torch.where(batch.weight > 0, next(losses), 0.0)
+        return loss.mul(batch.weight).sum(1) / batch.weight.sum(1)
 
     def _rate(self, step: int) -> float:
         """Returns the factor on the learning rate in a gradient step: a warm-up, then a cosine."""
@@ -408,11 +411,6 @@ class RolloutModule(BatchedModule):
         if s.compile == "never" or not can_compile(self.dataset.base.device):
             return False
         return s.compile == "always" or s.epochs * s.steps * s.horizon >= _WORTH_COMPILING
-
-
-def _weighted_mean(values: Tensor, weight: Tensor) -> Tensor:
-    """Returns the weighted mean over trajectories, `(N,)`; NaN where nothing has weight."""
-    return torch.where(weight > 0, values, 0.0).mul(weight).sum(1) / weight.sum(1)
 
 
 def train(shard: TrainingShard, report: Report) -> TrainedShard:

@@ -1,7 +1,7 @@
 """Samples the trajectories of gradient steps and of validation, and augments them.
 
 Trajectories are augmented where they are simulated (`RolloutBatch.scale`, `RolloutBatch.shift`).
-`Augmentation` does the same to single situations, for the valid range, with as many that are made
+`augmentation` does the same to single situations, for the valid range, with as many that are made
 faster.
 
 Shapes: P pairs, N networks, D trajectories of each, W windows of the longest pair.
@@ -12,6 +12,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from cfx.learners.base import Augment
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.policies.features import History
@@ -150,8 +151,10 @@ class TrajectorySampler:
         return weight.gather(1, self.validation_places)
 
 
-class Augmentation:
-    """Scales situations and makes some of them faster, as training does.
+def augmentation(
+    settings: RolloutSettings, time_gap: Tensor, generator: torch.Generator
+) -> Augment:
+    """Returns what scales situations and makes some of them faster, as training does.
 
     Args:
         settings: how much.
@@ -159,25 +162,17 @@ class Augmentation:
         generator: on the CPU.
     """
 
-    def __init__(
-        self, settings: RolloutSettings, time_gap: Tensor, generator: torch.Generator
-    ) -> None:
-        self.settings = settings
-        self.time_gap = time_gap
-        self.generator = generator
-
-    def __call__(self, history: History, pairs: Tensor) -> History:
-        """Returns other situations of pairs `(P,)`; signals `(P, W)` each."""
-        s, like = self.settings, history.gap
-        normal = torch.randn(like.shape, generator=self.generator).to(like)
-        draws = torch.rand((2, *like.shape), generator=self.generator).to(like)
-        scale = torch.exp(s.scaling * normal)
-        shift = torch.where(draws[0] < SHIFTED, s.speed_shift * draws[1], 0.0)
-        wider = shift * self.time_gap[pairs][:, None].to(like)
-        return History(
-            leader_speed=history.leader_speed * scale + shift,
-            leader_acceleration=history.leader_acceleration * scale,
-            follower_speed=history.follower_speed * scale + shift,
-            follower_acceleration=history.follower_acceleration * scale,
-            gap=history.gap * scale + wider,
+    def augment(history: History, pairs: Tensor) -> History:
+        like = history.gap
+        normal = torch.randn(like.shape, generator=generator).to(like)
+        draws = torch.rand((2, *like.shape), generator=generator).to(like)
+        scale = torch.exp(settings.scaling * normal)
+        shift = torch.where(draws[0] < SHIFTED, settings.speed_shift * draws[1], 0.0)
+        scaled = History(*(signal * scale for signal in history))
+        return scaled._replace(
+            leader_speed=scaled.leader_speed + shift,
+            follower_speed=scaled.follower_speed + shift,
+            gap=scaled.gap + shift * time_gap[pairs][:, None].to(like),
         )
+
+    return augment

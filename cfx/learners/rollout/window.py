@@ -366,20 +366,12 @@ class RolloutInputs:
         around = now[..., 0] + frames[:, None, None]
         simulated = now + torch.arange(1, windows * stride + 1, device=device)
         origin = _at(pairs.follower_position, each, now)
-        follower = torch.stack(
-            [
-                _at(pairs.follower_position, each, past) - origin,
-                _at(pairs.follower_speed, each, past),
-                _at(pairs.follower_acceleration, each, past),
-            ]
-        )
-        leader = torch.stack(
-            [
-                _at(pairs.leader_position, pair, around) - origin[..., 0],
-                _at(pairs.leader_speed, pair, around),
-                _at(pairs.leader_acceleration, pair, around),
-            ]
-        )
+        own = (pairs.follower_position, pairs.follower_speed, pairs.follower_acceleration)
+        ahead = (pairs.leader_position, pairs.leader_speed, pairs.leader_acceleration)
+        follower = torch.stack([_at(signal, each, past) for signal in own])
+        leader = torch.stack([_at(signal, pair, around) for signal in ahead])
+        follower[0] -= origin
+        leader[0] -= origin[..., 0]
         speed = _at(pairs.follower_speed, each, simulated)
         gap = _at(pairs.gap, each, simulated)
         leader_length = pairs.leader_length[pair]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from cfx.learners.rollout.dataset import RolloutBatch, usual_time_gaps
-from cfx.learners.rollout.sampling import Augmentation
+from cfx.learners.rollout.sampling import augmentation
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.window import RolloutInputs
 from cfx.policies.features import History
@@ -80,7 +80,7 @@ def test_situations_are_augmented_as_trajectories_are() -> None:
     time_gap = torch.tensor([1.0, 2.0], dtype=torch.float64)
     values = torch.full((2, 500), 5.0, dtype=torch.float64)
     history = History(values, values * 0.1, values, values * 0.1, values * 2)
-    augment = Augmentation(settings, time_gap, torch.Generator().manual_seed(0))
+    augment = augmentation(settings, time_gap, torch.Generator().manual_seed(0))
     after = augment(history, torch.arange(2))
     shift = after.follower_speed - 5.0
     torch.testing.assert_close(after.leader_speed - 5.0, shift)

@@ -34,7 +34,6 @@ from tests.learners.made import (
     untrained,
 )
 
-
 SHORT = QUICK | {"epochs": 3, "steps": 5, "horizon": 6, "learning_rate": 0.02}
 
 

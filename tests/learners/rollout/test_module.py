@@ -29,7 +29,6 @@ from tests.learners.made import (
     untrained,
 )
 
-
 FEATURES = ("time_headway", "acceleration")
 
 
