@@ -15,8 +15,8 @@ from cfx.policies.heads import trained_head
 from cfx.simulation.rollout import Compile
 
 
-class HeadSettings(Settings):
-    """Settings of the head."""
+class OptimisationSettings(Settings):
+    """Networks with their head, optimisation and validation."""
 
     head: Annotated[str, AfterValidator(trained_head("rollout"))] = Field(
         "offset",
@@ -32,11 +32,6 @@ class HeadSettings(Settings):
         le=64,
         description="sampled paths of each trajectory in training, for head=stochastic",
     )
-
-
-class EnsembleSettings(Settings):
-    """Ensemble."""
-
     ensemble_size: int = Field(
         4,
         ge=1,
@@ -44,11 +39,6 @@ class EnsembleSettings(Settings):
         description="networks of an ensemble, which answer together; each keeps other drivers for"
         " validation",
     )
-
-
-class OptimisationSettings(Settings):
-    """Optimisation and validation."""
-
     start: str | None = Field(
         None,
         description="the folder of a finished job, or cfx://NAME: networks begin as its network for"
@@ -81,8 +71,8 @@ class OptimisationSettings(Settings):
     )
 
 
-class SamplingSettings(Settings):
-    """Sampling of trajectories."""
+class TrajectorySettings(Settings):
+    """Sampling of trajectories, and cold starts, as of unseen drivers."""
 
     draws: int = Field(
         2,
@@ -109,11 +99,6 @@ class SamplingSettings(Settings):
         description="s of measured history that the policy observes before a trajectory in"
         " training, at most; null: all",
     )
-
-
-class ColdStartSettings(Settings):
-    """Cold starts, as of unseen drivers."""
-
     cold_start_fraction: float = Field(
         0.3,
         ge=0,
@@ -139,7 +124,7 @@ class ColdStartSettings(Settings):
 
 
 class LossSettings(Settings):
-    """Terms beside the job's objective."""
+    """Terms beside the job's objective, gradients through time, and switches of regimes."""
 
     gap_weight: float = Field(
         0.1, ge=0, description="weight of the gap's RMSE beside the job's objective"
@@ -156,11 +141,6 @@ class LossSettings(Settings):
         description="weight of the RMS jerk (m/s3) beside the errors; 0.01 costs little accuracy"
         " and makes the trajectories much smoother",
     )
-
-
-class GradientSettings(Settings):
-    """Gradients through time."""
-
     gradient_decay: float = Field(
         0.8,
         gt=0,
@@ -178,11 +158,6 @@ class GradientSettings(Settings):
         description="windows after which gradients are cut and memory is freed; null: the whole"
         " trajectory",
     )
-
-
-class RegimeSettings(Settings):
-    """Regime switches of the driving model."""
-
     temperature: float = Field(
         1.0,
         ge=0,
@@ -192,8 +167,9 @@ class RegimeSettings(Settings):
     temperature_end: float = Field(0.3, ge=0, description="the same in the last epoch")
 
 
-class DistillationSettings(Settings):
-    """Distillation."""
+# All settings of `rollout`: pydantic lists the fields of the last base first.
+class RolloutSettings(LossSettings, TrajectorySettings, OptimisationSettings):
+    """Distillation and computation."""
 
     distillation_epochs: int = Field(
         0,
@@ -202,30 +178,9 @@ class DistillationSettings(Settings):
         " acceleration (model=direct), trained before for the remaining number of epochs; for"
         " models with regimes",
     )
-
-
-class ComputeSettings(Settings):
-    """Computation."""
-
     compile: Compile = Field(
         "auto", description="the window that training repeats: auto: where it pays; always; never"
     )
-
-
-# Pydantic lists the fields of the last base first.
-class RolloutSettings(
-    ComputeSettings,
-    DistillationSettings,
-    RegimeSettings,
-    GradientSettings,
-    LossSettings,
-    ColdStartSettings,
-    SamplingSettings,
-    OptimisationSettings,
-    EnsembleSettings,
-    HeadSettings,
-):
-    """Settings of `rollout`."""
 
     @model_validator(mode="after")
     def _some_epochs_in_closed_loop(self) -> Self:
