@@ -8,7 +8,11 @@ import numpy as np
 import torch
 
 from cfx.data.pairs import Pair, PairSet
+from cfx.evaluation.closed_loop import Followers
+from cfx.evaluation.forecasts import LeaderFuture, Origins, Paths, sample_from_origins
 from cfx.models.base import DrivingModel, Leader
+from cfx.policies.agent import Agent
+from cfx.simulation.base import Stepper
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start
 
@@ -91,3 +95,17 @@ def wavy_pairs(
         ),
         "test",
     )
+
+
+def simulate_from_origins(
+    simulator: Stepper,
+    agent: Agent,
+    followers: Followers,
+    origins: Origins,
+    steps: int,
+    *,
+    leader: LeaderFuture = "given",
+) -> Paths:
+    """Simulates followers from origins on, where nothing is drawn."""
+    found = sample_from_origins(simulator, agent, followers, origins, steps, leader=leader)
+    return Paths(found.speed[0], found.travelled[0])

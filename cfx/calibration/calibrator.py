@@ -387,10 +387,8 @@ class Calibrator:
     def _solver_for(self, steps: int) -> Solver:
         """Returns the solver of a group of problems, for any part of it.
 
-        Whether work is compiled depends on how much there is, and its last bits on that.
-
-        Args:
-            steps: of all problems of the group, for one candidate.
+        Whether work is compiled depends on how much there is, and its last bits on that: `steps`
+        of all problems of the group, for one candidate.
         """
         simulator = self.solver.simulator.for_work(steps * self.solver.optimizer.evaluations())
         return replace(self.solver, simulator=simulator)

@@ -407,10 +407,7 @@ class PooledLosses:
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Yields columns of `total` `(K, q)` with their candidates, of `(K, q, n)` or `(1, q, n)`.
 
-        Args:
-            segments: some of those that are simulated.
-            simulated: how many are simulated for one candidate of each problem.
-            total, candidates: what is cut.
+        `simulated` segments are simulated at once for one candidate of each problem.
         """
         bound = min(self.memory, _BYTES_AT_ONCE)
         if segments.accumulates:

@@ -182,11 +182,6 @@ def _stages(searches: int, samples: int, each_step: int) -> tuple[list[tuple[int
 
     All searches share the first half of the samples, and the best quarter of them the other one:
     few steps show which are promising, and these go on to their minimum.
-
-    Args:
-        searches: at first.
-        samples: for all steps.
-        each_step: evaluations of one step of one search.
     """
     stages = []
     if searches >= _KEPT:

@@ -147,11 +147,6 @@ class Solver:
         A search stops at what it has tried. Where a parameter hardly matters, the prior alone
         says where it belongs, and its slope is too small for a search among steep ones. So each
         parameter in turn goes some part of the way to its default, as far as that is better.
-
-        Args:
-            losses: of the P problems, with the prior.
-            best: `(P, n)` in unit space.
-            default: the model's, `(n,)` in unit space.
         """
         at_once = max(1, self.memory // (losses.bytes_per_candidate * len(_WAY)))
         worked = losses.for_work(self.optimizer.evaluations())
@@ -162,11 +157,7 @@ class Solver:
         return torch.cat(parts)
 
     def _check_losses(self, losses: SegmentLosses | PooledLosses, solution: Solution) -> None:
-        """Computes the losses of what a third party's optimizer returns once more.
-
-        Raises:
-            PluginError: it has mixed up its candidates.
-        """
+        """Refuses a third party's optimizer that has mixed up its candidates."""
         if registry.is_own(self.optimizer):
             return
         again, found = losses(solution.best[:, None])[:, 0], solution.loss

@@ -16,10 +16,13 @@ import sys
 from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from importlib import import_module
-from typing import Any
+from typing import Any, TypeVar
+from weakref import WeakKeyDictionary
 
 from cfx.core import registry
 from cfx.core.errors import NotInstalledError, PluginError, nearest
+
+T = TypeVar("T")
 
 Check = Callable[..., None]
 """Takes a component and checks one statement of its kind's contract.
@@ -159,6 +162,18 @@ def violations(
             yield check.__name__, str(broken)
         except Exception as error:  # a plugin may raise anything
             yield check.__name__, f"the component raised {registry.in_words(error)}"
+
+
+_made: WeakKeyDictionary[Any, dict[object, Any]] = WeakKeyDictionary()
+
+
+def once(component: object, key: object, make: Callable[[], T]) -> T:
+    """Returns what `make` gives, which is asked once for all checks of one component."""
+    known = _made.setdefault(component, {})
+    if key not in known:
+        known[key] = make()
+    found: T = known[key]
+    return found
 
 
 def expect_tensor(

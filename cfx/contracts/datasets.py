@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
-from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from cfx.contracts import contract_of
+from cfx.contracts import contract_of, once
 from cfx.core.errors import CfxError, DataError
 from cfx.data.base import Dataset, DatasetSettings
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
@@ -97,14 +96,8 @@ def asking_for_too_much_is_an_error(dataset: Dataset) -> None:
     )
 
 
-_known: WeakKeyDictionary[Dataset, PairSet] = WeakKeyDictionary()
-
-
 def _loaded(dataset: Dataset) -> PairSet:
-    """Loads a dataset once for all checks."""
-    if dataset not in _known:
-        _known[dataset] = dataset.load()
-    return _known[dataset]
+    return once(dataset, "pairs", dataset.load)
 
 
 def _with(dataset: Dataset, **changes: object) -> Dataset:

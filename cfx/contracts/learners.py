@@ -10,13 +10,12 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
-from cfx.contracts import contract_of, expect_close
+from cfx.contracts import contract_of, expect_close, once
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingPairs, TrainingResult
@@ -61,9 +60,6 @@ def training_data(
     network, names = torch.arange(PAIRS), tuple(pair.pair_id for pair in pairs)
     if together:
         network, names = torch.zeros_like(network), ("all",)
-    labels = None
-    if needs_labels:
-        labels = _labels(split, truth)
     return TrainingData(
         simulator=MemoryStepper(model, pairs.dt),
         recorded=PairBatch.of(pairs),
@@ -72,7 +68,7 @@ def training_data(
             split=split,
             network=network,
             fixed=model.space.from_unit((model.space.to_unit(truth) + 0.25).clamp(0.05, 0.95)),
-            labels=labels,
+            labels=_labels(split, truth) if needs_labels else None,
         ),
         windows=WINDOWS,
         names=names,
@@ -82,12 +78,7 @@ def training_data(
 
 def _truth(pairs: PairSet, model: Krauss) -> Tensor:
     """Returns the drivers' parameters, `(P, n)`, SI units."""
-    rows = []
-    for pair in pairs:
-        row = []
-        for name in model.space.names:
-            row.append(pair.truth[name][0])
-        rows.append(row)
+    rows = [[pair.truth[name][0] for name in model.space.names] for pair in pairs]
     return torch.tensor(rows, dtype=torch.float64)
 
 
@@ -268,22 +259,15 @@ def curves_tell_how_it_went(learner: Learner) -> None:
     )
 
 
-_Fit = tuple[TrainingResult, TrainingData]
-_fits: WeakKeyDictionary[Learner, dict[tuple[int, int], _Fit]] = WeakKeyDictionary()
-
-
 def _fitted(learner: Learner, data: TrainingData) -> TrainingResult:
     """Fits each training data once for all checks of one learner: training takes the time."""
     return _fit(learner, data)[0]
 
 
-def _fit(learner: Learner, data: TrainingData) -> _Fit:
+def _fit(learner: Learner, data: TrainingData) -> tuple[TrainingResult, TrainingData]:
     """Returns the fit, and the training data that it was given, equal to these before it."""
-    known = _fits.setdefault(learner, {})
     key = (len(data.names), data.seed)
-    if key not in known:
-        known[key] = (learner.fit(_POLICY, data), data)
-    return known[key]
+    return once(learner, key, lambda: (learner.fit(_POLICY, data), data))
 
 
 def _answers(result: TrainingResult, data: TrainingData) -> Tensor:
@@ -327,12 +311,9 @@ def _agent(result: TrainingResult, data: TrainingData) -> Agent:
 
 
 def _state(result: TrainingResult) -> dict[str, Tensor]:
-    values = {}
-    for key, value in result.network.state_dict().items():
-        values[key] = value.detach().clone()
-    for key, value in result.scaler.state_dict().items():
-        values[f"scaler.{key}"] = value.detach().clone()
-    return values
+    scaler = {f"scaler.{key}": value for key, value in result.scaler.state_dict().items()}
+    values = {**result.network.state_dict(), **scaler}
+    return {key: value.detach().clone() for key, value in values.items()}
 
 
 def _equal(one: dict[str, Tensor], two: dict[str, Tensor]) -> bool:

@@ -71,13 +71,12 @@ def frames_that_do_not_count_do_not_matter(metric: Metric) -> None:
     outside = ~given.counted
     outside[:, 0] = False  # frame 0 is the measured state that the simulation starts from
     for value in (torch.nan, 1e3, -1e3):
+        changed: dict[str, Any] = {}
+        for name in ("speed", "gap", "measured_speed", "measured_gap", "leader_speed"):
+            changed[name] = getattr(given, name).masked_fill(outside, value)
         other = replace(
             given,
-            speed=given.speed.masked_fill(outside, value),
-            gap=given.gap.masked_fill(outside, value),
-            measured_speed=given.measured_speed.masked_fill(outside, value),
-            measured_gap=given.measured_gap.masked_fill(outside, value),
-            leader_speed=given.leader_speed.masked_fill(outside, value),
+            **changed,
             parameters=given.parameters.masked_fill(outside[..., None], value),
             at_limits=_flipped(given.at_limits, outside),
             outside=_flipped(given.outside, outside),

@@ -275,10 +275,14 @@ def gradients_are_right(model: DrivingModel) -> None:
         *(p[n] for n in names),
     )
     inputs = tuple(x.clone().requires_grad_() for x in inputs)
-    assert torch.autograd.gradcheck(step, inputs, eps=1e-7, atol=1e-4, raise_exception=False), (
-        "analytic and numeric gradients differ: the model claims `differentiable`, and learning"
-        " relies on it"
-    )
+    slopes = torch.autograd.grad(step(*inputs).sum(), inputs, materialize_grads=True)
+    for k, slope in enumerate(slopes):
+        # Followers do not depend on one another, so that one difference serves all of them.
+        up, down = (step(*inputs[:k], inputs[k] + e, *inputs[k + 1 :]) for e in (1e-7, -1e-7))
+        assert torch.allclose(slope, (up - down).detach() / 2e-7, rtol=1e-3, atol=1e-4), (
+            "analytic and numeric gradients differ: the model claims `differentiable`, and learning"
+            " relies on it"
+        )
 
 
 def gradients_are_finite_at_every_extreme(model: DrivingModel) -> None:
@@ -364,16 +368,15 @@ def collision_free_as_claimed(model: DrivingModel, leader_deceleration: float = 
         raise NotApplicable("the model does not claim to be free of collisions")
     speed = torch.linspace(1, 33, 33, dtype=torch.float64)
     leader = _stop_and_go(speed, leader_deceleration)
-    for headway in (1.8, 3.0, 6.0):
-        start = Start(-LENGTH - 3.0 - headway * speed, speed, torch.zeros_like(speed))
-        out = simulate(model, None, leader, start, DT)
-        hit = out.collided.any(dim=-1)
-        assert not bool(hit.any()), (
-            "the model claims `collision_free`, but with default parameters it hits a leader"
-            " that brakes at "
-            f"{leader_deceleration} m/s2 from {speed[hit][0].item():g} m/s, starting {headway} s"
-            " and 3 m behind"
-        )
+    headway = torch.tensor([1.8, 3.0, 6.0], dtype=torch.float64)[:, None]
+    start = Start(-LENGTH - 3.0 - headway * speed, speed, torch.zeros_like(speed))
+    hit = simulate(model, None, leader, start, DT).collided.any(dim=-1)
+    assert not bool(hit.any()), (
+        "the model claims `collision_free`, but with default parameters it hits a leader"
+        " that brakes at "
+        f"{leader_deceleration} m/s2 from {speed.expand_as(hit)[hit][0].item():g} m/s, starting"
+        f" {headway.expand_as(hit)[hit][0].item():g} s and 3 m behind"
+    )
 
 
 def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
@@ -384,7 +387,7 @@ def can_be_compiled_as_one_graph(model: DrivingModel) -> None:
 
     # torch gives up after eight recompilations of a function, and to it all these are one.
     whole = torch.compile(  # type: ignore[call-overload]  # torch's overloads leave isolate_recompiles out
-        step, fullgraph=True, backend="aot_eager", isolate_recompiles=True
+        step, fullgraph=True, backend="eager", isolate_recompiles=True
     )
     with torch.no_grad(), warnings.catch_warnings():
         # PyTorch's advice to take a newer Python than 3.13.0; it says nothing about the model.

@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import cache
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import torch
@@ -19,7 +18,7 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.search import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.contracts import NotApplicable, contract_of
+from cfx.contracts import NotApplicable, contract_of, once
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.data.style import StyleSettings, measure_style
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
@@ -214,14 +213,9 @@ def a_policy_without_training_is_not_trained(protocol: Protocol) -> None:
     )
 
 
-_results: WeakKeyDictionary[Protocol, ProtocolResult] = WeakKeyDictionary()
-
-
 def _protocol_result(protocol: Protocol) -> ProtocolResult:
     """Runs the context as it is once for all checks of one protocol."""
-    if protocol not in _results:
-        _results[protocol] = protocol.run(context(recording()))
-    return _results[protocol]
+    return once(protocol, "result", lambda: protocol.run(context(recording())))
 
 
 class _Watched(Learner):

@@ -9,12 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
-from weakref import WeakKeyDictionary
 
 import torch
 from torch import Tensor
 
-from cfx.contracts import NotApplicable, contract_of, expect_close, expect_tensor
+from cfx.contracts import NotApplicable, contract_of, expect_close, expect_tensor, once
 from cfx.core.errors import CfxError, ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.idm_sumo import IdmSumo
@@ -288,9 +287,6 @@ def gradients_are_as_claimed(simulator: Simulator, model: Model = None) -> None:
     )
 
 
-_steppers: WeakKeyDictionary[Simulator, Stepper] = WeakKeyDictionary()
-
-
 def _require(simulator: Simulator) -> None:
     """Leaves out what needs something that is not installed."""
     try:
@@ -327,11 +323,7 @@ def _ready(simulator: Simulator, model: Model) -> tuple[Stepper, _Scene]:
 
 def _stepper(simulator: Simulator, model: DrivingModel) -> Stepper:
     """Returns one stepper for all checks of a simulator: it may take seconds to start."""
-    known = _steppers.get(simulator)
-    if known is None or known.model is not model:
-        known = simulator.stepper(model, DT)
-        _steppers[simulator] = known
-    return known
+    return once(simulator, model, lambda: simulator.stepper(model, DT))
 
 
 def _scene(model: DrivingModel) -> _Scene:

@@ -250,22 +250,12 @@ class _Track:
         return self.speed[:, self._now :], self._gap[:, self._now :], counted
 
 
-def outside_in_words(agent: Agent, loop: ClosedLoop) -> str:
-    """Returns "37 % of steps outside what the policy has learned (speed above 18 m/s)".
-
-    It is "" where no step was, or where nobody knows.
-    """
-    if agent.valid_range is None or loop.outside is None or loop.beyond is None:
-        return ""
-    steps = int(loop.counted.sum())
-    outside = int((loop.outside & loop.counted).sum())
-    return share_in_words(agent.valid_range, outside, steps, loop.beyond)
-
-
 def outside_of_scopes(
     agent: Agent, scopes: Mapping[str, Mapping[str, ClosedLoop]]
 ) -> dict[str, str]:
-    """Returns `Evaluation.outside`: `outside_in_words` of each scope where something was outside.
+    """Returns `Evaluation.outside`: by scope what was outside of what the policy has learned.
+
+    Such as "37 % of steps outside what the policy has learned (speed above 18 m/s)".
 
     Args:
         agent: what drove as `policy`.
@@ -273,17 +263,20 @@ def outside_of_scopes(
     """
     found = {}
     for scope, loops in scopes.items():
-        words = ""
-        if "policy" in loops:
-            words = outside_in_words(agent, loops["policy"])
-        if words:
-            found[scope] = words
+        loop = loops.get("policy")
+        if loop is None or loop.outside is None or loop.beyond is None:
+            continue
+        if agent.valid_range is not None:
+            steps = int(loop.counted.sum())
+            outside = int((loop.outside & loop.counted).sum())
+            words = share_in_words(agent.valid_range, outside, steps, loop.beyond)
+            if words:
+                found[scope] = words
     return found
 
 
 PAIRS_AT_ONCE = 1024
 """Pairs that are simulated together: enough for batches, few enough for a worker's memory."""
-
 
 _TENSORS = 12
 """Tensors as large as these that an evaluation holds at once: several methods, several of each."""
@@ -299,11 +292,9 @@ class ClosedLoopShard:
     first: Tensor
 
 
-def simulate_shard(shard: ClosedLoopShard, report: Report) -> ClosedLoop:
-    """Simulates the pairs of a shard, wherever it is."""
-    found = simulate_closed_loop(shard.simulator, shard.agent, shard.followers, shard.first)
-    report(len(shard.first))
-    return found
+def simulate_shard(shard: ClosedLoopShard, _report: Report) -> ClosedLoop:
+    """Simulates the pairs of a shard, wherever it is; nobody is shown the progress of seconds."""
+    return simulate_closed_loop(shard.simulator, shard.agent, shard.followers, shard.first)
 
 
 def simulate_in_shards(
@@ -323,20 +314,16 @@ def simulate_in_shards(
     """
     # What it has learned from is a long list, and drives nothing.
     agent = replace(agent, trained_on=TrainedOn())
-    whole = ClosedLoopShard(simulator, agent, followers, first)
     batch = followers.batch
     if len(batch) <= PAIRS_AT_ONCE:
-        return simulate_shard(whole, _nothing)
+        return simulate_closed_loop(simulator, agent, followers, first)
     joined = _Joined(len(batch), 1 + int((batch.lengths - 1 - first).max()))
-    with closing(engine.map(simulate_shard, _cut(whole), _nothing)) as results:
+    shards = _cut(ClosedLoopShard(simulator, agent, followers, first))
+    with closing(engine.map(simulate_shard, shards, lambda _: None)) as results:
         for number, part in results:
             joined.put(number, part)
     give_back()
     return joined.whole()
-
-
-def _nothing(_pairs: int) -> None:
-    """Progress that nobody is shown: a simulation takes seconds."""
 
 
 def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
@@ -360,10 +347,6 @@ class _Joined:
 
     Those of many pairs lie in files (`cfx.core.memory`). Frames that a shard has not, because all
     its pairs end before, repeat its last one and do not count, as frames after the end of a pair.
-
-    Args:
-        pairs: P.
-        columns: K + 1.
     """
 
     def __init__(self, pairs: int, columns: int) -> None:

@@ -20,7 +20,7 @@ from cfx.core.memory import give_back
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import CLUSTERS, StyleResult
-from cfx.evaluation.closed_loop import ClosedLoop
+from cfx.evaluation.closed_loop import PAIRS_AT_ONCE, ClosedLoop
 from cfx.evaluation.metrics.base import (
     RECORDED,
     LeftOut,
@@ -36,9 +36,6 @@ from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import long_table, values_of
 from cfx.simulation.trajectory import TRANSIENT_S
 
-PAIRS_AT_ONCE = 1024
-"""Pairs that are measured together."""
-
 
 def parts_of(pairs: int) -> Iterator[slice]:
     """Yields the rows of some pairs, then of the next.
@@ -53,40 +50,12 @@ def parts_of(pairs: int) -> Iterator[slice]:
             give_back()
 
 
-def trajectories_of(
-    batch: PairBatch,
-    first: Tensor,
-    loops: Mapping[str, ClosedLoop],
-    spaces: Mapping[str, ParameterSpace],
-) -> dict[str, Trajectories]:
-    """Returns closed loops, and the recorded drivers (`real`), beside the recording.
-
-    Args:
-        batch: P pairs.
-        first: `(P,)`, the frame of the recording at which each closed loop begins.
-        loops: of each method.
-        spaces: for each method the bounds within which its parameters were chosen.
-    """
-    found = {}
-    for method, loop in loops.items():
-        found[method] = beside_recording(batch, first, loop, spaces[method])
-    of_any = next(iter(found.values()))
-    found[RECORDED] = replace(
-        of_any,
-        speed=of_any.measured_speed,
-        gap=of_any.measured_gap,
-        parameters=torch.full_like(of_any.parameters, torch.nan),
-        at_limits=None,
-        outside=None,
-    )
-    return found
-
-
 def beside_recording(
     batch: PairBatch, first: Tensor, loop: ClosedLoop, space: ParameterSpace
 ) -> Trajectories:
     """Returns closed loops of P pairs, which begin at frames `first` `(P,)` of the recording."""
-    index = _frames(batch, first, loop.counted.shape[1])
+    frames = first[:, None] + torch.arange(loop.counted.shape[1], device=first.device)
+    index = frames.clamp(max=batch.mask.shape[1] - 1)
     return Trajectories(
         speed=loop.speed,
         gap=loop.gap,
@@ -109,26 +78,6 @@ def rows_of(loop: ClosedLoop, rows: slice) -> ClosedLoop:
         if name != "beyond" and values is not None:
             chosen[name] = values[rows]
     return loop._replace(**chosen)
-
-
-def _frames(batch: PairBatch, first: Tensor, count: int) -> Tensor:
-    """Returns the frames of the recording from frames `first` `(P,)` on, `(P, count)`."""
-    frames = first[:, None] + torch.arange(count, device=first.device)
-    return frames.clamp(max=batch.mask.shape[1] - 1)
-
-
-def simulated_pairs(
-    pairs: PairSet, batch: PairBatch, first: Tensor, loops: Mapping[str, ClosedLoop]
-) -> Sequence[PairTrajectory]:
-    """Returns the test part of each pair; of many pairs, each is made when it is asked for.
-
-    Args:
-        pairs, batch, first, loops: as for `SimulatedPairs`.
-    """
-    found = SimulatedPairs(pairs, batch, first, loops)
-    if len(pairs) > PAIRS_AT_ONCE:
-        return found
-    return tuple(found)
 
 
 @dataclass(frozen=True)
@@ -253,12 +202,13 @@ def evaluate(
         found = _improvements(values, scope, drivers, seed)
         if found:
             improvements[scope] = found
+    simulated = SimulatedPairs(pairs, batch, first, loops)
     return Evaluation(
         about=_about(tested, measures, space.names),
         values=values,
         measured=infos,
         improvements=improvements,
-        trajectories=simulated_pairs(pairs, batch, first, loops),
+        trajectories=simulated if len(pairs) > PAIRS_AT_ONCE else tuple(simulated),
         parameters=policy_space.tuned,
         left_out=left_out,
     )
@@ -291,12 +241,27 @@ def _scopes(
     full_trajectory: Mapping[str, ClosedLoop],
     spaces: Mapping[str, ParameterSpace],
 ) -> dict[str, dict[str, Trajectories]]:
-    """Returns what is measured in each scope, beside the recording."""
-    of_test = trajectories_of(batch, first, test, spaces)
-    scopes = {"test": of_test, "steady": _after_transient(of_test)}
-    if full_trajectory:
-        start = torch.zeros_like(first)
-        scopes["full_trajectory"] = trajectories_of(batch, start, full_trajectory, spaces)
+    """Returns what is measured in each scope, and the recorded drivers, beside the recording."""
+    scopes = {}
+    begins = {"test": (test, first), "full_trajectory": (full_trajectory, torch.zeros_like(first))}
+    for scope, (loops, begin) in begins.items():
+        found = {}
+        for method, loop in loops.items():
+            found[method] = beside_recording(batch, begin, loop, spaces[method])
+        if not found:
+            continue
+        of_any = next(iter(found.values()))
+        found[RECORDED] = replace(
+            of_any,
+            speed=of_any.measured_speed,
+            gap=of_any.measured_gap,
+            parameters=torch.full_like(of_any.parameters, torch.nan),
+            at_limits=None,
+            outside=None,
+        )
+        scopes[scope] = found
+        if scope == "test":
+            scopes["steady"] = _after_transient(found)
     return scopes
 
 
@@ -305,7 +270,7 @@ def _after_transient(trajectories: Mapping[str, Trajectories]) -> dict[str, Traj
     found = {}
     for method, one in trajectories.items():
         time = torch.arange(one.counted.shape[1], device=one.counted.device) * one.dt
-        found[method] = one.counting(one.counted & (time > TRANSIENT_S + 1e-6))
+        found[method] = replace(one, counted=one.counted & (time > TRANSIENT_S + 1e-6))
     return found
 
 
@@ -333,14 +298,12 @@ class _Measures:
         for one in list(self._metrics):
             try:
                 values = _values(one, scopes)
-            except (
-                Exception
-            ) as error:  # a plugin may raise anything, and must not cost the job its results
+            # A plugin may raise anything, and must not cost the job its results.
+            except Exception as error:
                 if one.distribution == registry.OWN:
                     raise
-                self._left_out.append(
-                    leave_out(one.name, one.distribution, registry.in_words(error))
-                )
+                reason = registry.in_words(error)
+                self._left_out.append(leave_out(one.name, one.distribution, reason))
                 self._metrics.remove(one)
                 continue
             of_metric = self._values.setdefault(one.name, {})
@@ -358,7 +321,7 @@ class _Measures:
         for one in self._metrics:
             for key, parts in self._values[one.name].items():
                 measured[key] = np.concatenate(parts)
-        infos = tuple(_info(one, self._scopes) for one in self._metrics)
+        infos = tuple(one.info(self._scopes) for one in self._metrics)
         return measured, infos, tuple(self._left_out)
 
 
@@ -378,30 +341,11 @@ def _values(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]
     return found
 
 
-def _info(one: MeasuredMetric, scopes: Collection[str]) -> MetricInfo:
-    metric = one.metric
-    return MetricInfo(
-        name=one.name,
-        unit=metric.unit,
-        direction=metric.direction,
-        summary=metric.summary,
-        heading=metric.heading,
-        meaning=metric.meaning,
-        scopes=tuple(scope for scope in metric.scopes if scope in scopes),
-        headline=metric.headline,
-        distribution=one.distribution,
-    )
-
-
 class _Improvements(Mapping[str, Improvement]):
     """The policy's improvement over every other method, each computed when it is asked for.
 
     A calibration asks for none: resampling, and importing what resamples, takes a second or two.
-
-    Args:
-        speed: a column per method, a row per pair: RMSE of speed, m/s; `policy` is among them.
-        drivers: of each pair.
-        seed: of the bootstrap.
+    `speed` has a column per method and a row per pair: RMSE of speed, m/s.
     """
 
     def __init__(self, speed: pd.DataFrame, drivers: Sequence[str], seed: int) -> None:
@@ -444,9 +388,7 @@ def _about(tested: ComparedPairs, measures: _Measures, names: Sequence[str]) -> 
     methods = list(measures.parameters)
     drivers = [pair.driver for pair in pairs]
     clusters = by_driver["cluster"].loc[drivers].map(dict(enumerate(CLUSTERS)))
-    folds = np.zeros(len(pairs), dtype=np.int64)
-    if tested.fold is not None:
-        folds = tested.fold.numpy()
+    folds = np.zeros(len(pairs), np.int64) if tested.fold is None else tested.fold.numpy()
     of_pair = {
         "pair_id": [pair.pair_id for pair in pairs],
         "recording": [pair.recording for pair in pairs],

@@ -114,19 +114,21 @@ def measured_paths(batch: PairBatch, origins: Origins, steps: int) -> tuple[Path
     return Paths(batch.follower_speed[rows, index], position - position[:, :1]), recorded
 
 
-def simulate_from_origins(
+def sample_from_origins(
     simulator: Stepper,
     agent: Agent,
     followers: Followers,
     origins: Origins,
     steps: int,
+    generators: Sequence[torch.Generator | None] = (None,),
     *,
     leader: LeaderFuture = "given",
 ) -> Paths:
-    """Simulates followers from origins on, with an agent in the loop.
+    """Samples paths of followers from origins on, with an agent in the loop.
 
-    Up to an origin the agent observes what was measured (burn-in, driver features). From there on
-    it sees the simulated follower only. All origins are one batch, in chunks that fit the memory.
+    Up to an origin the agent observes what was measured (burn-in, driver features), once for all
+    paths. From there on it sees the simulated follower only. One path of all origins is one batch,
+    in chunks that fit the memory.
 
     Args:
         simulator: the model and its time step.
@@ -135,33 +137,9 @@ def simulate_from_origins(
             origin.
         origins: Q of them.
         steps: K, at least 1.
-        leader: what is known of the leader after the origin.
-    """
-    sampled = sample_from_origins(
-        simulator, agent, followers, origins, steps, (None,), leader=leader
-    )
-    return Paths(sampled.speed[0], sampled.travelled[0])
-
-
-def sample_from_origins(
-    simulator: Stepper,
-    agent: Agent,
-    followers: Followers,
-    origins: Origins,
-    steps: int,
-    generators: Sequence[torch.Generator | None],
-    *,
-    leader: LeaderFuture = "given",
-) -> Paths:
-    """Samples paths of followers from origins on; see `simulate_from_origins`.
-
-    What was measured is observed once for all paths. One path of all origins is one batch.
-
-    Args:
-        simulator, agent, followers, origins, steps: as there.
         generators: S of them, on the CPU, one for each path; None: what a stochastic agent does if
             nothing is drawn.
-        leader: as there.
+        leader: what is known of the leader after the origin.
 
     Returns:
         Paths `(S, Q, K + 1)`.
@@ -173,10 +151,8 @@ def sample_from_origins(
         if followers.history is None and not agent.core.driver_features:
             state = _observed(agent, followers, chunk)
         part = _with_future(batch[chunk.pair], chunk.frame, steps, leader)
-        own_base = None
-        if base is not None:
-            own_base = base[chunk.pair]
-        known = Followers(part, followers.network[chunk.pair], own_base, followers.history)
+        own = None if base is None else base[chunk.pair]
+        known = Followers(part, followers.network[chunk.pair], own, followers.history)
         index = chunk.frame[:, None] + torch.arange(steps + 1, device=chunk.frame.device)
         index = index.clamp(max=part.mask.shape[1] - 1)
         leader_position = part.leader_position.gather(1, index)
@@ -199,11 +175,6 @@ def _observed(agent: Agent, followers: Followers, origins: Origins) -> AgentStat
 
     What was observed up to an origin is the beginning of what is observed up to the next one. Not
     so where driver features condition the networks: each origin has its own.
-
-    Args:
-        agent: observes.
-        followers: P pairs.
-        origins: Q of them.
     """
     pairs, row = torch.unique(origins.pair, return_inverse=True)
     at_origins = _begun(agent, followers, origins.pair)
@@ -223,9 +194,7 @@ def _observed(agent: Agent, followers: Followers, origins: Origins) -> AgentStat
 
 def _begun(agent: Agent, followers: Followers, pairs: Tensor) -> AgentState:
     """Returns the state of drivers of some pairs before their first window."""
-    own = None
-    if followers.base is not None:
-        own = followers.base[pairs]
+    own = None if followers.base is None else followers.base[pairs]
     return agent.begin(followers.network[pairs], DriverContext(own))
 
 
@@ -241,15 +210,9 @@ def _chunks(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origin
 
 
 def _with_future(batch: PairBatch, origin: Tensor, steps: int, leader: LeaderFuture) -> PairBatch:
-    """Returns pairs that last to the end of their forecasts, with what is known of their leaders.
+    """Returns Q pairs that last to the end of their forecasts, one for each origin `(Q,)`.
 
     Frames after a recording's end hold something, and are in no error (`measured_paths`).
-
-    Args:
-        batch: Q pairs, one for each origin.
-        origin: `(Q,)`, frames.
-        steps: K.
-        leader: what is known of the leader after the origin.
     """
     frames = torch.arange(batch.mask.shape[1], device=origin.device)
     after = frames - origin[:, None]

@@ -20,7 +20,7 @@ from cfx.core.parameters import Parameter
 from cfx.evaluation.headline import improvement_key
 from cfx.evaluation.metrics.base import SCOPES, LeftOut, MetricInfo
 from cfx.evaluation.statistics import Improvement
-from cfx.evaluation.tables import in_text, summaries, values_of, wide_table
+from cfx.evaluation.tables import at_places, in_text, summaries, values_of, wide_table
 
 if TYPE_CHECKING:
     from cfx.models.base import DrivingModel
@@ -212,8 +212,12 @@ class Evaluation:
         With forecasts there are also the columns `forecast_METRIC`.
         """
         table = wide_table(self.about, self.values, self.measured)
-        columns = _forecast_columns(self.values, table[["pair_id", "method"]])
-        return pd.concat([table, columns], axis=1)
+        forecast = self.values[self.values["scope"] == FORECAST]
+        columns = {}
+        for metric in forecast["metric"].unique():
+            wide = values_of(forecast, metric, FORECAST)
+            columns[f"{FORECAST}_{metric}"] = at_places(wide, table)
+        return table.assign(**columns)
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -306,19 +310,3 @@ class Evaluation:
 def _in_order(methods: pd.Series) -> tuple[str, ...]:
     present = set(methods)
     return tuple(method for method in METHODS if method in present)
-
-
-def _forecast_columns(values: pd.DataFrame, places: pd.DataFrame) -> pd.DataFrame:
-    """Returns the columns `forecast_METRIC` of `pairs.csv`; none without forecasts.
-
-    Args:
-        values: the long table.
-        places: pair_id and method of each row.
-    """
-    index = pd.MultiIndex.from_frame(places)
-    columns = {}
-    of_forecasts = values[values["scope"] == FORECAST]
-    for metric, rows in of_forecasts.groupby("metric", sort=False, observed=True):
-        column = rows.set_index(["pair_id", "method"])["value"]
-        columns[f"{FORECAST}_{metric}"] = column.reindex(index).to_numpy()
-    return pd.DataFrame(columns, index=places.index)

@@ -82,13 +82,7 @@ def _row(
     gap: pd.DataFrame,
     seed: int,
 ) -> dict[str, object]:
-    """Returns the row of some pairs of a site.
-
-    Args:
-        about: labels of these pairs.
-        speed: RMSE of speed, a row per pair and a column per method.
-        gap: RMSE of gap, likewise.
-    """
+    """Returns the row of some pairs of a site, of which `about` has the labels."""
     row: dict[str, object] = {
         "scope": scope,
         "site": site,
@@ -127,13 +121,7 @@ def _mean_of_sites(
     speed: pd.DataFrame,
     seed: int,
 ) -> dict[str, object]:
-    """Returns the row in which each site counts once.
-
-    Args:
-        rows: of the sites.
-        about: labels of all pairs.
-        speed: RMSE of speed, a row per pair and a column per method.
-    """
+    """Returns the row in which each site counts once; `rows` are theirs."""
     table = pd.DataFrame(rows)
     row: dict[str, object] = {
         "scope": scope,
@@ -157,10 +145,6 @@ def _interval_over_sites(gain: pd.Series, about: pd.DataFrame, seed: int) -> tup
     """Returns the 95 % interval of the mean over sites of their mean gain.
 
     Drivers are resampled within each site, with all their pairs.
-
-    Args:
-        gain: of each pair, by its id.
-        about: labels of these pairs.
     """
     generator = np.random.default_rng(seed)
     means = np.zeros(_RESAMPLES)

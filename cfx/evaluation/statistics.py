@@ -67,10 +67,7 @@ class Improvement:
 
     def metrics(self) -> dict[str, float]:
         """Returns the statistics by name."""
-        values = {}
-        for name in STATISTICS:
-            values[name] = float(getattr(self, name))
-        return values
+        return {name: float(getattr(self, name)) for name in STATISTICS}
 
 
 def improvement_statistics(
@@ -93,7 +90,8 @@ def improvement_statistics(
     counts = np.isfinite(baseline) & np.isfinite(policy) & (baseline > 0)
     before, after = baseline[counts], policy[counts]
     if not counts.any():
-        return _undefined(len(baseline))
+        unknown = dict.fromkeys(STATISTICS, math.nan)
+        return Improvement(**unknown, pairs=0, undefined=len(baseline), drivers=0)
     if drivers is None:
         who = np.arange(len(before))
     else:
@@ -134,27 +132,10 @@ def mean_interval(
     every = np.asarray(values, dtype=np.float64)
     counts = np.isfinite(every)
     if not counts.any():
-        return float("nan"), float("nan"), float("nan")
+        return math.nan, math.nan, math.nan
     who = np.unique(np.asarray(drivers)[counts], return_inverse=True)[1]
     low, high = _interval(every[counts], who, seed)
     return float(every[counts].mean()), low, high
-
-
-def _undefined(pairs: int) -> Improvement:
-    """Returns the statistics of pairs none of which counts."""
-    nan = float("nan")
-    return Improvement(
-        mean=nan,
-        trimmed_mean=nan,
-        median=nan,
-        ci95_low=nan,
-        ci95_high=nan,
-        win_rate=nan,
-        p_value=nan,
-        pairs=0,
-        undefined=pairs,
-        drivers=0,
-    )
 
 
 def _interval(gain: Floats, who: NDArray[np.intp], seed: int) -> tuple[float, float]:
@@ -168,7 +149,7 @@ def _interval(gain: Floats, who: NDArray[np.intp], seed: int) -> tuple[float, fl
 
     number = np.bincount(who).astype(float)
     if len(number) < 2:
-        return float("nan"), float("nan")
+        return math.nan, math.nan
     if len(number) > _MOST_RESAMPLED:
         average = float(gain.mean())
         residual = np.bincount(who, gain) - average * number

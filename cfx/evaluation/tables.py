@@ -93,10 +93,13 @@ def in_text(rows: pd.DataFrame) -> pd.DataFrame:
 
 def values_of(values: pd.DataFrame, metric: str, scope: str) -> pd.DataFrame:
     """Returns one metric in one scope: a row per pair, in their order, and a column per method."""
-    rows = in_text(values[(values["metric"] == metric) & (values["scope"] == scope)])
-    # `pivot_table` would drop a method whose values are all undefined.
-    wide = rows.pivot(index="pair_id", columns="method", values="value")  # noqa: PD010
-    return wide.reindex(rows["pair_id"].drop_duplicates())
+    rows = values[(values["metric"] == metric) & (values["scope"] == scope)]
+    row, pairs = pd.factorize(rows["pair_id"])
+    column, methods = pd.factorize(rows["method"].astype(object), sort=True)
+    wide = np.full((len(pairs), len(methods)), np.nan)
+    wide[row, column] = rows["value"]
+    index = pd.Index(list(pairs), name="pair_id")
+    return pd.DataFrame(wide, index, pd.Index(list(methods), name="method"))
 
 
 def wide_table(
@@ -109,11 +112,10 @@ def wide_table(
     """
     parameters = [name for name in about if str(name).startswith(("parameter_", COLUMN))]
     columns: dict[str, pd.Series] = {}
-    places = _Places(about)
     for scope in SCOPES:
         for metric in metrics:
             if scope in metric.scopes:
-                column = _column(values, metric.name, scope, places)
+                column = at_places(values_of(values, metric.name, scope), about)
                 if metric.summary == "sum":
                     column = _whole_numbers(column)
                 columns[column_of(metric.name, scope)] = column
@@ -161,36 +163,19 @@ def summarize(values: pd.Series, summary: str) -> float:
     return float(values.agg(summary))
 
 
-class _Places:
-    """The rows of a table by pair and method.
+def at_places(wide: pd.DataFrame, places: pd.DataFrame) -> pd.Series:
+    """Returns the values that pairs and methods of a table have; NaN where it has none.
 
     Args:
-        about: columns pair_id and method.
+        wide: a row per pair, a column per method.
+        places: columns pair_id and method.
     """
-
-    def __init__(self, about: pd.DataFrame) -> None:
-        self._pairs = pd.Index(about["pair_id"].unique())
-        self._methods = pd.Index(about["method"].unique())
-        self._numbers = self._number(about)
-
-    def of(self, rows: pd.DataFrame) -> pd.Series:
-        """Returns the values that rows of the long table have at these places; else NaN."""
-        found = np.full(len(self._pairs) * len(self._methods), np.nan)
-        number = self._number(rows)
-        found[number[number >= 0]] = rows["value"].to_numpy()[number >= 0]
-        return pd.Series(found[self._numbers])
-
-    def _number(self, rows: pd.DataFrame) -> NDArray[np.int64]:
-        """Returns the number of each row's pair and method; negative where there are none such."""
-        pair = self._pairs.get_indexer(pd.Index(rows["pair_id"]))
-        method = self._methods.get_indexer(pd.Index(rows["method"]))
-        number = pair.astype(np.int64) * len(self._methods) + method
-        return np.where((pair < 0) | (method < 0), -1, number)
-
-
-def _column(values: pd.DataFrame, metric: str, scope: str, places: _Places) -> pd.Series:
-    """Returns a metric at each place (pair and method)."""
-    return places.of(values[(values["metric"] == metric) & (values["scope"] == scope)])
+    row = wide.index.get_indexer(pd.Index(places["pair_id"]))
+    column = wide.columns.get_indexer(pd.Index(places["method"]))
+    found = np.full(len(places), np.nan)
+    known = (row >= 0) & (column >= 0)
+    found[known] = wide.to_numpy(np.float64)[row[known], column[known]]
+    return pd.Series(found, index=places.index)
 
 
 def _whole_numbers(column: pd.Series) -> pd.Series:
@@ -203,7 +188,7 @@ def _whole_numbers(column: pd.Series) -> pd.Series:
 def _improvements(about: pd.DataFrame, values: pd.DataFrame) -> dict[str, pd.Series]:
     """Returns each method's improvement of the RMSE of speed over each baseline, by column."""
     speed = values_of(values, "rmse_speed", "test")
-    own = _column(values, "rmse_speed", "test", _Places(about))
+    own = at_places(speed, about)
     columns = {}
     for baseline in about["method"].drop_duplicates():
         if baseline == "policy":

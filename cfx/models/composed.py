@@ -317,13 +317,7 @@ def with_residual(space: ParameterSpace) -> ParameterSpace:
 
 
 def _braked(both: Tensor, alone: Tensor, follower: Follower, leader: Leader) -> Tensor:
-    """Returns the acceleration `(*batch,)`, m/s2, with all braking that is needed.
-
-    Args:
-        both: of the model and the residual.
-        alone: that the model wants.
-        follower, leader: where they are.
-    """
+    """Returns `both`, that of model and residual, with all braking that is needed, m/s2."""
     no_more = torch.minimum(both, alone)
     gap = bumper_gap(follower, leader)
     difference = follower.speed - leader.speed

@@ -191,21 +191,9 @@ def _follow(
     hold: int,
     s: SyntheticSettings,
 ) -> tuple[Tensor, Tensor]:
-    """Simulates one place of all platoons.
+    """Simulates one place of all S platoons; returns positions and speeds `(S, F)`.
 
-    Shapes: S platoons, F frames, W windows of `hold` frames, n parameters.
-
-    Args:
-        parameters: `(S, W, n)`.
-        leader_position: `(S, F)`, m.
-        leader_speed: `(S, F)`, m/s.
-        leader_length: `(S,)`, m.
-
-    Returns:
-        Position `(S, F)`, m, and speed `(S, F)`, m/s.
-
-    Raises:
-        DataError: a driver collides.
+    Parameters `(S, W, n)` hold for `hold` frames each; the leaders are `(S, F)`.
     """
     import torch
 

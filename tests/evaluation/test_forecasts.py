@@ -13,7 +13,7 @@ from torch import Tensor
 from cfx.data.pairs import PairBatch
 from cfx.evaluation import forecasts
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.evaluation.forecasts import LeaderFuture, Origins, measured_paths, simulate_from_origins
+from cfx.evaluation.forecasts import LeaderFuture, Origins, measured_paths
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
 from cfx.policies.recurrent import GruPolicy
@@ -26,7 +26,7 @@ from cfx_forecasts.errors import (
     kinematic_paths,
     summarize_forecasts,
 )
-from tests.drives import straight_pairs, wavy_pairs
+from tests.drives import simulate_from_origins, straight_pairs, wavy_pairs
 from tests.evaluation.test_closed_loop import adaptive, constant
 
 MODEL = Krauss()

@@ -19,7 +19,7 @@ from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.evaluation.forecasts import Origins, simulate_from_origins
+from cfx.evaluation.forecasts import Origins
 from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
@@ -36,7 +36,7 @@ from cfx_estimators.particle_filter import ParticleFilterPolicy, reweighted
 from cfx_estimators.recalibrate import RecalibratePolicy
 from cfx_estimators.ukf import UkfPolicy, unscented_update
 from cfx_sumo.vtype import SumoVType
-from tests.drives import wavy_pairs
+from tests.drives import simulate_from_origins, wavy_pairs
 
 WINDOWS = WindowSettings()
 ESTIMATORS = {

@@ -9,8 +9,8 @@ from __future__ import annotations
 import logging
 import re
 from abc import abstractmethod
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Collection, Sequence
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from cfx.core import registry
@@ -75,10 +75,6 @@ class Trajectories:
     space: ParameterSpace
     at_limits: Tensor | None = None
     outside: Tensor | None = None
-
-    def counting(self, counted: Tensor) -> Trajectories:
-        """Returns the same trajectories with other frames that count, `(P, K + 1)` bool."""
-        return replace(self, counted=counted)
 
     def __len__(self) -> int:
         return len(self.speed)
@@ -215,6 +211,21 @@ class MeasuredMetric:
     metric: Metric
     distribution: str
 
+    def info(self, measured: Collection[str]) -> MetricInfo:
+        """Returns what is to be known of it; `measured` are the scopes that were."""
+        metric = self.metric
+        return MetricInfo(
+            name=self.name,
+            unit=metric.unit,
+            direction=metric.direction,
+            summary=metric.summary,
+            heading=metric.heading,
+            meaning=metric.meaning,
+            scopes=tuple(scope for scope in metric.scopes if scope in measured),
+            headline=metric.headline,
+            distribution=self.distribution,
+        )
+
 
 @dataclass(frozen=True)
 class LeftOut:
@@ -248,9 +259,15 @@ class MetricSet:
         Raises:
             PluginError: there is no metric of a name, or one that is named is broken.
         """
-        if chosen == "all":
-            return _all()
-        return cls(_ordered([_made(entry) for entry in entries_of(chosen)]))
+        found, left_out = [], []
+        for entry in entries_of(chosen):
+            try:
+                found.append(_made(entry))
+            except PluginError as error:
+                if chosen != "all" or entry.distribution == registry.OWN:
+                    raise
+                left_out.append(leave_out(entry.name, entry.distribution, str(error)))
+        return cls(_ordered(found), tuple(left_out))
 
     @classmethod
     def own(cls) -> MetricSet:
@@ -274,18 +291,6 @@ def leave_out(name: str, distribution: str, reason: str) -> LeftOut:
     """Returns a note of a broken metric, after one warning that names its distribution."""
     log.warning("The metric %s of the distribution %s is left out: %s", name, distribution, reason)
     return LeftOut(name, distribution, reason)
-
-
-def _all() -> MetricSet:
-    found, left_out = [], []
-    for entry in entries_of("all"):
-        try:
-            found.append(_made(entry))
-        except PluginError as error:
-            if entry.distribution == registry.OWN:
-                raise
-            left_out.append(leave_out(entry.name, entry.distribution, str(error)))
-    return MetricSet(_ordered(found), tuple(left_out))
 
 
 def _made(entry: registry.Entry) -> MeasuredMetric:

@@ -128,6 +128,17 @@ class Trained:
     notes: Mapping[str, Any]
     calibration: Mapping[str, float]
 
+    def result(self, evaluation: Evaluation) -> ProtocolResult:
+        """Returns what the protocol delivers, after its test."""
+        return ProtocolResult(
+            evaluation,
+            self.policy_after(evaluation),
+            self.curves,
+            self.labels,
+            self.notes,
+            self.calibration,
+        )
+
     def policy_after(self, evaluation: Evaluation) -> Agent:
         """Returns the policy, which knows of its test what error to expect of it."""
         policy = self.test.policy
@@ -171,16 +182,7 @@ class AcrossDrivers(Protocol):
 
     def run(self, context: ProtocolContext) -> ProtocolResult:
         trained = self.trained(context)
-        test = trained.test
-        evaluation = test.evaluation(self.settings.histories, fold=trained.fold)
-        return ProtocolResult(
-            evaluation,
-            trained.policy_after(evaluation),
-            trained.curves,
-            trained.labels,
-            trained.notes,
-            calibration=trained.calibration,
-        )
+        return trained.result(trained.test.evaluation(self.settings.histories, fold=trained.fold))
 
     def trained(self, context: ProtocolContext) -> Trained:
         """Calibrates and trains, and returns what is to be tested."""
@@ -228,8 +230,7 @@ class AcrossDrivers(Protocol):
         s = self.settings
         start = population
         if s.base == "default":
-            default = context.space.defaults(dtype=population.dtype, device=population.device)
-            start = default.expand_as(population)
+            start = context.defaults(population).expand_as(population)
         base = None
         if s.base == "own":
             space = context.simulator.model.adaptation_space
@@ -250,15 +251,13 @@ class AcrossDrivers(Protocol):
         training_data = _training_data(context, full, members, found, names)
         training_result = context.learner.fit(context.policy, training_data)
         policy = context.ready(context.policy, training_result, names)
-        shrinkage = s.shrinkage if s.base == "own" else 0.0
         rule = ContextRule(
             driver_specific=s.base == "own",
-            shrinkage=shrinkage,
+            shrinkage=s.shrinkage if s.base == "own" else 0.0,
             history_s=s.history,
             combines=s.combine,
         )
-        policy = replace(policy, context_rule=rule, population=found.population)
-        return policy, training_result
+        return replace(policy, context_rule=rule, population=found.population), training_result
 
     def _warn(self, context: ProtocolContext) -> None:
         """Warns of settings that do not fit the learner's."""
@@ -318,26 +317,14 @@ def _training_data(
     start = found.start[network]
     # Also where both bases are the same: for unseen drivers nothing of their history is observed.
     base = start if found.base is None else found.base[rows]
-    labels = None
-    if found.labels is not None:
-        labels = found.labels.select(index)
-    return TrainingData(
-        simulator=context.simulator,
-        recorded=context.batch,
-        pairs=TrainingPairs(
-            index=rows,
-            split=full[index],
-            network=network,
-            fixed=start,
-            base=base,
-            labels=labels,
-            drivers=tuple(context.pairs[number].driver for number in index.tolist()),
-            sites=tuple(context.pairs[number].site for number in index.tolist()),
-        ),
-        windows=context.windows,
-        names=names,
-        seed=context.seed,
-        objective=context.objective,
-        workspace=context.workspace,
-        engine=context.engine,
+    pairs = TrainingPairs(
+        index=rows,
+        split=full[index],
+        network=network,
+        fixed=start,
+        base=base,
+        labels=None if found.labels is None else found.labels.select(index),
+        drivers=tuple(context.pairs[number].driver for number in index.tolist()),
+        sites=tuple(context.pairs[number].site for number in index.tolist()),
     )
+    return context.training_data(pairs, names)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 from abc import abstractmethod
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -23,9 +23,22 @@ from cfx.core.errors import DataError, PluginError
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import LearnedFrom, PairBatch, PairSet
 from cfx.data.style import StyleResult
+from cfx.evaluation.closed_loop import (
+    ClosedLoop,
+    Followers,
+    outside_of_scopes,
+    simulate_in_shards,
+)
+from cfx.evaluation.evaluate import ComparedPairs, evaluate
 from cfx.evaluation.metrics.base import MetricSet
-from cfx.evaluation.result import Evaluation
-from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingResult
+from cfx.evaluation.result import Evaluation, Platoon
+from cfx.learners.base import (
+    CURVE_COLUMNS,
+    Learner,
+    TrainingData,
+    TrainingPairs,
+    TrainingResult,
+)
 from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.base import Policy
 from cfx.policies.core import AgentCore
@@ -155,6 +168,46 @@ class ProtocolContext:
                 " (data.recording, data.pair_ids)"
             )
 
+    def training_data(self, pairs: TrainingPairs, names: tuple[str, ...]) -> TrainingData:
+        """Returns what the learner is given: some of the pairs, and a name for each network."""
+        return TrainingData(
+            simulator=self.simulator,
+            recorded=self.batch,
+            pairs=pairs,
+            windows=self.windows,
+            names=names,
+            seed=self.seed,
+            objective=self.objective,
+            workspace=self.workspace,
+            engine=self.engine,
+        )
+
+    def simulated(self, agent: Agent, followers: Followers, first: Tensor) -> ClosedLoop:
+        """Simulates followers from frames `first` on; see `simulate_in_shards`."""
+        return simulate_in_shards(self.engine, self.simulator, agent, followers, first)
+
+    def compared(
+        self,
+        tested: ComparedPairs,
+        scopes: Mapping[str, Mapping[str, ClosedLoop]],
+        policy: Agent,
+        platoon: Platoon | None,
+    ) -> Evaluation:
+        """Measures closed loops of all methods; `scopes` as for `evaluate`."""
+        evaluation = evaluate(
+            tested,
+            scopes,
+            self.space,
+            seed=self.seed,
+            policy_space=policy.model_space,
+            metrics=self.metrics,
+        )
+        return replace(evaluation, platoon=platoon, outside=outside_of_scopes(policy, scopes))
+
+    def defaults(self, like: Tensor) -> Tensor:
+        """Returns the model's default parameters `(n,)`, SI units, in the dtype of others."""
+        return self.space.defaults(dtype=like.dtype, device=like.device)
+
     def constant(self, policy: Policy, parameters: Tensor) -> Agent:
         """Returns an agent of a policy as built, without training: the baselines.
 
@@ -195,7 +248,11 @@ class ProtocolContext:
             PluginError: the learner or the policy did not deliver such networks.
         """
         who = registry.origin(self.learner if policy.trainable else policy)
-        _check_training_result(who, training_result)
+        if not isinstance(training_result, TrainingResult):
+            raise PluginError(
+                f"{who}: fit must return a cfx.TrainingResult, but returned a"
+                f" {type(training_result).__name__}"
+            )
         head = self._head(policy, training_result)
         _check_networks(who, training_result, len(names), head.answers)
         # Constant parameters are calibrated on these pairs, too.
@@ -253,14 +310,6 @@ class ProtocolResult:
     labels: Labels | None
     notes: Mapping[str, Any] = field(default_factory=dict)
     calibration: Mapping[str, float] = field(default_factory=dict)
-
-
-def _check_training_result(who: str, training_result: object) -> None:
-    if not isinstance(training_result, TrainingResult):
-        raise PluginError(
-            f"{who}: fit must return a cfx.TrainingResult, but returned a"
-            f" {type(training_result).__name__}"
-        )
 
 
 @torch.no_grad()

@@ -80,17 +80,13 @@ class FinishedPolicy:
         split = Split.of(pairs, context.windows, context.split)
         split.check_test_parts(pairs, context.windows, context.split)
         fixed = context.calibrator.fixed(pairs, batch, split.frame)
-        default = context.space.defaults(dtype=fixed.dtype, device=fixed.device)
-        start = default[None]
-        base = None
+        start, base = context.defaults(fixed)[None], None
         if policy.base is not None:
             start = policy.base.to(fixed.dtype)
             if policy.context_rule.driver_specific:
                 # Of the model alone: constant parameters of a driver are a baseline, `shrunk`.
                 base = policy.base_of(fixed)[:, : fixed.shape[1]]
-        population = None
-        if policy.population is not None:
-            population = policy.population.to(fixed.dtype)
+        population = policy.population
         test = HeldOut(
             context=context,
             pairs=pairs,
@@ -100,7 +96,7 @@ class FinishedPolicy:
             fixed=fixed,
             base=base,
             unseen_base=start.expand(len(pairs), -1),
-            population=population,
+            population=None if population is None else population.to(fixed.dtype),
             policy=policy,
         )
         notes = {
@@ -265,11 +261,4 @@ class Transfer(Protocol):
 
     def run(self, context: ProtocolContext) -> ProtocolResult:
         found = self.finished.tested(context)
-        return ProtocolResult(
-            found.test.evaluation(),
-            found.test.policy,
-            found.curves,
-            found.labels,
-            found.notes,
-            calibration=found.calibration,
-        )
+        return found.result(found.test.evaluation())

@@ -79,12 +79,7 @@ def assign_folds(
 
 
 def _require_drivers_apart(pairs: PairSet, fold: Sequence[int], together: Together) -> None:
-    """Raises DataError if a driver is tested in one fold and learned from for it.
-
-    Args:
-        fold: of each pair.
-        together: what a fold keeps together.
-    """
+    """Raises DataError if a driver is tested in one fold and learned from for it."""
     first: dict[str, tuple[int, Pair]] = {}
     for number, pair in zip(fold, pairs, strict=True):
         place = number if number >= -1 else -2 - number

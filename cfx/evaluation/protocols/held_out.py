@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes, simulate_in_shards
-from cfx.evaluation.evaluate import ComparedPairs, closed_loop_errors, evaluate
+from cfx.evaluation.closed_loop import ClosedLoop, Followers
+from cfx.evaluation.evaluate import ComparedPairs, closed_loop_errors
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.protocols.past import (
@@ -59,11 +59,6 @@ class HeldOut:
     policy: Agent
 
     @property
-    def drivers(self) -> list[str]:
-        """The driver of each pair, Q of them."""
-        return [pair.driver for pair in self.pairs]
-
-    @property
     def combines(self) -> bool:
         """Whether the drivers' own parameters drive beside the policy in the test part."""
         return self.policy.context_rule.combines
@@ -71,15 +66,8 @@ class HeldOut:
     @cached_property
     def past(self) -> PastErrors:
         """What the drivers' pasts say of the policy and of their own parameters."""
-        return past_errors(
-            self.context,
-            self.policy,
-            self.pairs,
-            self.batch,
-            self.network,
-            self.unseen_base,
-            self.first,
-        )
+        unknown = Followers(self.batch, self.network, self.unseen_base)
+        return past_errors(self.context, self.policy, self.pairs, unknown, self.first)
 
     def evaluation(
         self, histories: Sequence[float] = (), *, fold: Tensor | None = None
@@ -101,27 +89,16 @@ class HeldOut:
         if self.combines or (is_from_elsewhere and self.policy.policy.trainable):
             tables["past"] = self._past_table(loops, fold)
         scopes = {"test": loops, "full_trajectory": self._full_trajectory(methods)}
-        evaluation = evaluate(
-            ComparedPairs(self.pairs, self.batch, self.first, context.style, fold),
-            scopes,
-            context.space,
-            policy_space=self.policy.model_space,
-            seed=context.seed,
-            metrics=context.metrics,
-        )
-        return replace(
-            evaluation,
-            platoon=self._platoons(methods),
-            tables=tables,
-            outside=outside_of_scopes(self.policy, scopes),
-        )
+        tested = ComparedPairs(self.pairs, self.batch, self.first, context.style, fold)
+        platoon = self._platoons(methods)
+        return replace(context.compared(tested, scopes, self.policy, platoon), tables=tables)
 
     def methods_without_history(self) -> dict[str, Agent]:
         """Returns the agents that need nothing of a test driver beforehand, by method."""
         context, networks = self.context, len(self.policy.names)
-        default = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
+        default = context.defaults(self.fixed).expand(networks, -1)
         methods = {
-            "default": context.constant(DefaultPolicy(), default.expand(networks, -1)),
+            "default": context.constant(DefaultPolicy(), default),
             "policy": self.policy,
         }
         if self.population is not None:
@@ -136,9 +113,7 @@ class HeldOut:
             followers = self._followers(rule.history_s)
             if name == "policy" and self.combines:
                 followers = replace(followers, own=self.past.together_with(self.fixed))
-            loops[name] = simulate_in_shards(
-                context.engine, context.simulator, agent, followers, self.first
-            )
+            loops[name] = context.simulated(agent, followers, self.first)
         loops["fixed"] = self._constant(self.fixed)
         if self.base is not None and self.policy.base is not None and rule.shrinkage > 0:
             loops["shrunk"] = self._constant(self.base)
@@ -150,24 +125,17 @@ class HeldOut:
         return Followers(self.batch, self.network, base, history)
 
     def _past_table(self, loops: Mapping[str, ClosedLoop], fold: Tensor | None) -> pd.DataFrame:
-        """Returns a row per driver: what their past says, and what came of it.
-
-        Args:
-            loops: of the test part, by method.
-            fold: in which fold each pair is tested; None: the policy says what to expect.
-        """
+        """Returns a row per driver: what their past says, and what came of it in `loops`."""
         context, past = self.context, self.past
         alone, share, expected = loops["policy"], np.ones_like(past.policy), np.sqrt(past.policy)
         if self.combines:
             share, expected = past.weight, past.both
-            alone = simulate_in_shards(
-                context.engine, context.simulator, self.policy, self._followers(None), self.first
-            )
+            alone = context.simulated(self.policy, self._followers(None), self.first)
         loops = {"fixed": loops["fixed"], "alone": alone, "policy": loops["policy"]}
         table = pd.DataFrame(
             {
                 "pair_id": [pair.pair_id for pair in self.pairs],
-                "driver": self.drivers,
+                "driver": [pair.driver for pair in self.pairs],
                 "share": share,
                 "past_rmse_speed_fixed": np.sqrt(past.fixed),
                 "past_rmse_speed_alone": np.sqrt(past.policy),
@@ -192,29 +160,23 @@ class HeldOut:
         """Simulates the test part with constant parameters of each driver, `(Q, n)`."""
         agent = self.context.constant(FixedPolicy(), parameters)
         each = torch.arange(len(self.first), device=self.first.device)
-        followers = Followers(self.batch, each)
-        return simulate_in_shards(
-            self.context.engine, self.context.simulator, agent, followers, self.first
-        )
+        return self.context.simulated(agent, Followers(self.batch, each), self.first)
 
     def _full_trajectory(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
         """Simulates the test trajectories from their first frame on."""
-        begin = torch.zeros_like(self.first)
-        followers = Followers(self.batch, self.network)
+        begin, followers = torch.zeros_like(self.first), Followers(self.batch, self.network)
         loops = {}
         for name, agent in methods.items():
-            loops[name] = simulate_in_shards(
-                self.context.engine, self.context.simulator, agent, followers, begin
-            )
+            loops[name] = self.context.simulated(agent, followers, begin)
         return loops
 
     def _platoons(self, methods: Mapping[str, Agent]) -> Platoon | None:
-        context, names = self.context, self.policy.names
-        default = context.space.defaults(dtype=self.fixed.dtype, device=self.fixed.device)
+        context = self.context
         agents: dict[str, tuple[Agent, Sequence[str]]] = {}
         for name, agent in methods.items():
-            agents[name] = (agent, names)
-        agents["default"] = (context.constant(DefaultPolicy(), default[None]), ("any",))
+            agents[name] = (agent, self.policy.names)
+        default = context.constant(DefaultPolicy(), context.defaults(self.fixed)[None])
+        agents["default"] = (default, ("any",))
         return measure_platoons(context.simulator.model, agents)
 
     def history(self, histories: Sequence[float], fixed: ClosedLoop) -> pd.DataFrame:
@@ -242,13 +204,8 @@ class HeldOut:
     ) -> pd.DataFrame:
         """Simulates the test part after one amount of history, s; None: all there is."""
         context = self.context
-        loop = simulate_in_shards(
-            context.engine,
-            context.simulator,
-            self.policy,
-            Followers(self.batch, self.network, base, amount),
-            self.first,
-        )
+        followers = Followers(self.batch, self.network, base, amount)
+        loop = context.simulated(self.policy, followers, self.first)
         speed, gap = closed_loop_errors(self.batch, self.first, loop)
         observed = self.first.cpu().numpy() * context.simulator.dt
         text = f"{100 * context.split:.0f} %"

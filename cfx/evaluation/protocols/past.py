@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.closed_loop import ClosedLoop, Followers, OwnParameters, simulate_in_shards
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, OwnParameters
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.result import Array
 from cfx.policies.agent import Agent
@@ -90,9 +90,7 @@ def past_errors(
     context: ProtocolContext,
     policy: Agent,
     pairs: PairSet,
-    batch: PairBatch,
-    network: Tensor,
-    base: Tensor,
+    followers: Followers,
     first: Tensor,
 ) -> PastErrors:
     """Simulates the last part of D drivers' pasts with the policy and with their own parameters.
@@ -100,12 +98,11 @@ def past_errors(
     Args:
         context: what the protocol composes.
         policy: the policy.
-        pairs, batch: the drivers' D pairs.
-        network: which of the policy's networks drives each, `(D,)`.
-        base: base parameters of drivers of whom nothing is known, `(D, n)`.
+        pairs: the drivers' D pairs.
+        followers: the same, with the base parameters of drivers of whom nothing is known.
         first: the last frame of each driver's past, `(D,)`.
     """
-    stride = context.windows.stride
+    stride, batch = context.windows.stride, followers.batch
     cut = (EARLIER * first).long() // stride * stride
     shortest = round(SHORTEST_S / batch.dt)
     known = (cut >= shortest) & (first - cut >= shortest)
@@ -114,8 +111,9 @@ def past_errors(
         rows = known.nonzero()[:, 0]
         numbers = rows.tolist()
         pairs = pairs.take(numbers)
-        first, cut, network, base = first[rows], cut[rows], network[rows], base[rows]
-        batch = batch[rows].until(first)
+        first, cut, network = first[rows], cut[rows], followers.network[rows]
+        assert followers.base is not None
+        base, batch = followers.base[rows], batch[rows].until(first)
         early = context.calibrator.fixed(pairs, batch, cut.cpu()).to(base)
         if policy.base is not None and policy.context_rule.driver_specific:
             base = policy.base_of(early)[:, : early.shape[1]]
@@ -123,8 +121,7 @@ def past_errors(
         residual = policy.head.driven_model(context.simulator.model) is not context.simulator.model
 
         def errors(agent: Agent, followers: Followers) -> Tensor:
-            loop = simulate_in_shards(context.engine, context.simulator, agent, followers, cut)
-            return _speed_errors(loop, batch, cut)
+            return _speed_errors(context.simulated(agent, followers, cut), batch, cut)
 
         of_policy = errors(policy, Followers(batch, network, base))
         of_fixed = errors(context.constant(FixedPolicy(), early), Followers(batch, each))

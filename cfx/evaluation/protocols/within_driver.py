@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import replace
 from typing import ClassVar, Literal
 
 import torch
@@ -11,12 +10,12 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.core.component import Settings
-from cfx.evaluation.closed_loop import ClosedLoop, Followers, outside_of_scopes, simulate_in_shards
-from cfx.evaluation.evaluate import ComparedPairs, evaluate
+from cfx.evaluation.closed_loop import ClosedLoop, Followers
+from cfx.evaluation.evaluate import ComparedPairs
 from cfx.evaluation.platoon import measure_platoons
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Platoon
-from cfx.learners.base import TrainingData, TrainingPairs
+from cfx.learners.base import TrainingPairs
 from cfx.policies.agent import Agent
 from cfx.policies.constant import DefaultPolicy, FixedPolicy
 from cfx.policies.core import ALL, group_by
@@ -64,44 +63,25 @@ class WithinDriver(Protocol):
         labels = context.labels(split.windows, fixed)
         network, names = self._networks(context)
         if context.policy.trainable:
-            training_data = TrainingData(
-                simulator=context.simulator,
-                recorded=batch,
-                pairs=TrainingPairs(
-                    index=torch.arange(len(batch), device=batch.lengths.device),
-                    split=split,
-                    network=network,
-                    fixed=fixed,
-                    base=fixed if self.settings.networks == "all" else None,
-                    labels=labels,
-                    drivers=tuple(pair.driver for pair in pairs),
-                ),
-                windows=context.windows,
-                names=names,
-                seed=context.seed,
-                objective=context.objective,
-                workspace=context.workspace,
-                engine=context.engine,
+            training_pairs = TrainingPairs(
+                index=torch.arange(len(batch), device=batch.lengths.device),
+                split=split,
+                network=network,
+                fixed=fixed,
+                base=fixed if self.settings.networks == "all" else None,
+                labels=labels,
+                drivers=tuple(pair.driver for pair in pairs),
             )
+            training_data = context.training_data(training_pairs, names)
             training_result = context.learner.fit(context.policy, training_data)
         else:
             training_result = context.untrained(context.policy, fixed)
         policy = context.ready(context.policy, training_result, names)
         first = (split.frame * (not whole)).to(batch.lengths.device)
         scopes = {"test": _test_part(context, policy, network, first, fixed)}
-        evaluation = evaluate(
-            ComparedPairs(pairs, batch, first, context.style),
-            scopes,
-            context.space,
-            policy_space=policy.model_space,
-            seed=context.seed,
-            metrics=context.metrics,
-        )
-        evaluation = replace(
-            evaluation,
-            platoon=self._platoons(context, policy, fixed),
-            outside=outside_of_scopes(policy, scopes),
-        )
+        tested = ComparedPairs(pairs, batch, first, context.style)
+        platoon = self._platoons(context, policy, fixed)
+        evaluation = context.compared(tested, scopes, policy, platoon)
         return ProtocolResult(
             evaluation,
             policy,
@@ -131,22 +111,14 @@ class WithinDriver(Protocol):
 def _test_part(
     context: ProtocolContext, policy: Agent, network: Tensor, first: Tensor, fixed: Tensor
 ) -> dict[str, ClosedLoop]:
-    """Simulates the test part of P pairs by all methods.
-
-    Args:
-        context: what the protocol composes.
-        policy: what was learned.
-        network: which of its networks each pair is tested with, `(P,)`.
-        first: the last measured frame before the test part, `(P,)`.
-        fixed: driver-specific parameters, `(P, n)`.
-    """
+    """Simulates the test part of P pairs, from frames `first` `(P,)` on, by all methods."""
     default = context.constant(DefaultPolicy(), fixed)
     constant = context.constant(FixedPolicy(), fixed)
     each = torch.arange(len(first), device=first.device)
     alone = Followers(context.batch, each)
     learned = Followers(context.batch, network, base=fixed)
-    methods = {"default": (default, alone), "fixed": (constant, alone), "policy": (policy, learned)}
-    loops = {}
-    for name, (agent, followers) in methods.items():
-        loops[name] = simulate_in_shards(context.engine, context.simulator, agent, followers, first)
-    return loops
+    return {
+        "default": context.simulated(default, alone, first),
+        "fixed": context.simulated(constant, alone, first),
+        "policy": context.simulated(policy, learned, first),
+    }

@@ -120,17 +120,14 @@ class Forecast(FoldsOrFinished):
         evaluation = test.evaluation(self.settings.histories, fold=trained.fold)
         tables = self._forecasts(test)
         values = [in_text(evaluation.values), forecast_values(tables["forecasts"])]
-        return ProtocolResult(
-            replace(
+        return replace(
+            trained.result(evaluation),
+            evaluation=replace(
                 evaluation,
                 values=pd.concat(values, ignore_index=True),
                 tables={**evaluation.tables, **tables},
             ),
-            trained.policy_after(evaluation),
-            trained.curves,
-            trained.labels,
-            {**trained.notes, "forecasts": self._described(tables["forecasts"])},
-            calibration=trained.calibration,
+            notes={**trained.notes, "forecasts": self._described(tables["forecasts"])},
         )
 
     def _check(self, context: ProtocolContext) -> None:
@@ -194,7 +191,7 @@ class Forecast(FoldsOrFinished):
 
     def _say_who_is_forecast(self, test: HeldOut, origins: Origins) -> None:
         """Logs how many drivers there are forecasts of, and horizons that few or none reach."""
-        drivers = np.asarray(test.drivers, dtype=object)
+        drivers = np.asarray([pair.driver for pair in test.pairs], dtype=object)
         left = test.batch.lengths[origins.pair] - 1 - origins.frame
         known = len(set(drivers))
         counts = {}

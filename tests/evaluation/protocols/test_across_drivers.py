@@ -23,10 +23,12 @@ from cfx.core.errors import DataError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.data.tidy import write_tidy
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
+from cfx.evaluation.result import Purpose
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.base import Policy
+from cfx.policies.constant import DefaultPolicy, FixedPolicy
 from cfx.policies.core import Ensemble
 from cfx.policies.features import History
 from cfx.policies.recurrent import GruPolicy
@@ -281,49 +283,33 @@ def test_the_saved_policy_drives_unseen_drivers(result: cfx.JobResult) -> None:
     assert policy.networks_for(unseen).tolist() == [3, 3]
 
 
-def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_them(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_them() -> None:
     """Another trajectory of a driver changes other folds' networks, never that of their own."""
-    monkeypatch.chdir(tmp_path)
-    overrides = [
-        *QUICK,
-        "protocol=across_drivers",
-        "protocol.folds=3",
-        "policy.hidden_size=4",
-        "cache.enabled=false",
-    ]
-    before = cfx.run(overrides)
-    load = SyntheticDataset.load
-
-    def changed(self: SyntheticDataset) -> PairSet:
-        pairs = load(self)
-        first = pairs[0]
-        slower: dict[str, Any] = {"follower_speed": first.follower_speed * 0.9}
-        return replace(pairs, pairs=(replace(first, **slower), *pairs.pairs[1:]))
-
-    monkeypatch.setattr(SyntheticDataset, "load", changed)
-    after = cfx.run(overrides)
-    fold = int(before.pairs.fold.iloc[0])
-    assert fold == int(after.pairs.fold.iloc[0])
+    pairs = protocols.recording()
+    slower: dict[str, Any] = {"follower_speed": pairs[0].follower_speed * 0.9}
+    changed = replace(pairs, pairs=(replace(pairs[0], **slower), *pairs.pairs[1:]))
+    before, after = (
+        AcrossDrivers(folds=3, histories=()).run(protocols.context(one)) for one in (pairs, changed)
+    )
+    first, second = before.evaluation.table, after.evaluation.table
+    fold = int(first.fold.iloc[0])
+    assert fold == int(second.fold.iloc[0])
     one, two = before.policy.network.state_dict(), after.policy.network.state_dict()
     assert all(torch.equal(one[key][fold], two[key][fold]) for key in one)
     others = [k for k in range(3) if k != fold]
     assert all(any(not torch.equal(one[key][k], two[key][k]) for key in one) for k in others)
-    same = before.pairs.method == "population"
+    same = (first.method == "population") & (first.fold == fold)
     columns = ["fold", "parameter_t_r"]
-    kept = before.pairs[same & (before.pairs.fold == fold)][columns]
-    pd.testing.assert_frame_equal(kept, after.pairs[same & (after.pairs.fold == fold)][columns])
+    pd.testing.assert_frame_equal(first[same][columns], second[same][columns])
 
 
-@pytest.mark.parametrize("policy", ["fixed", "default"])
-def test_a_baseline_as_policy_is_no_method_of_its_own(
-    policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    result = cfx.run([*QUICK, "protocol=across_drivers", "protocol.folds=2", f"policy={policy}"])
-    assert "rmse_speed/policy" not in result.metrics
-    assert set(result.pairs["method"]) == {"default", "population", "fixed"}
+@pytest.mark.parametrize("policy", [FixedPolicy(), DefaultPolicy()])
+def test_a_baseline_as_policy_is_no_method_of_its_own(policy: Policy) -> None:
+    context = protocols.context(protocols.recording(), policy=policy)
+    found = AcrossDrivers(folds=2).run(context).evaluation
+    found = replace(found, purpose=Purpose.of(Krauss(), policy)).distinct_methods()
+    assert "rmse_speed/policy" not in found.metrics()
+    assert set(found.table["method"]) == {"default", "population", "fixed"}
 
 
 def test_short_pairs_are_learned_from_but_not_tested() -> None:
@@ -362,42 +348,48 @@ def rollout(folder: Path, *changes: str) -> cfx.JobResult:
     return cfx.run([*QUICK, "protocol=across_drivers", *small, f"hydra.run.dir={folder}", *changes])
 
 
-def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(tmp_path: Path) -> None:
-    result = rollout(tmp_path / "one", "protocol.histories=[0,5]", "data.platoon_size=4")
-    history = pd.read_parquet(tmp_path / "one" / "history.parquet")
+@pytest.fixture(scope="module")
+def learned(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
+    """A job that learns by rollout, and compares amounts of history."""
+    folder = tmp_path_factory.mktemp("rollout") / "one"
+    return rollout(folder, "protocol.histories=[0,5]", "data.platoon_size=4")
+
+
+def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(
+    learned: cfx.JobResult,
+) -> None:
+    history = pd.read_parquet(learned.folder / "history.parquet")
     assert set(history["base"]) == {"own", "population"}
     assert list(dict.fromkeys(history["amount"])) == ["0 s", "5 s", "80 %"]
     whole = history[(history["base"] == "own") & (history["amount"] == "80 %")].set_index(
         "pair_id"
     )["rmse_speed"]
-    policy = result.pairs[result.pairs["method"] == "policy"].set_index("pair_id")["rmse_speed"]
+    policy = learned.pairs[learned.pairs["method"] == "policy"].set_index("pair_id")["rmse_speed"]
     pd.testing.assert_series_equal(whole, policy, check_names=False, rtol=1e-9)
-    again = cfx.load(tmp_path / "one").policy
+    again = cfx.load(learned.folder).policy
     assert again.base is not None
-    assert torch.equal(again.base, result.policy.base)  # type: ignore[arg-type]  # it has one
-    assert again.context_rule.shrinkage == result.policy.context_rule.shrinkage == 0.7
+    assert torch.equal(again.base, learned.policy.base)  # type: ignore[arg-type]  # it has one
+    assert again.context_rule.shrinkage == learned.policy.context_rule.shrinkage == 0.7
     assert isinstance(again.network, Ensemble)
     assert again.network.size == 2
-    kept = result.policy.network.state_dict()
+    kept = learned.policy.network.state_dict()
     assert all(torch.equal(value, kept[key]) for key, value in again.network.state_dict().items())
     assert {
         "hard_braking/policy",
         "jerk/policy",
         "at_bounds/policy",
         "platoon/collisions/policy",
-    } <= result.metrics.keys()
+    } <= learned.metrics.keys()
 
 
-def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
-    one = rollout(tmp_path / "one", "protocol.histories=[0]")
-    other = rollout(tmp_path / "other", "protocol.history=0", "protocol.histories=[]")
-    history = pd.read_parquet(tmp_path / "one" / "history.parquet")
-    none = history[(history["base"] == "own") & (history["amount"] == "0 s")][
-        "rmse_speed"
-    ].to_numpy()
+def test_less_history_is_what_the_plot_says(learned: cfx.JobResult, tmp_path: Path) -> None:
+    none = ["protocol.history=0", "protocol.histories=[]"]
+    other = rollout(tmp_path / "other", *none, "data.platoon_size=4")
+    history = pd.read_parquet(learned.folder / "history.parquet")
+    without = history[(history["base"] == "own") & (history["amount"] == "0 s")]["rmse_speed"]
     policy = other.pairs[other.pairs["method"] == "policy"]["rmse_speed"].to_numpy()
-    np.testing.assert_allclose(none, policy, rtol=1e-9)
-    assert not np.allclose(one.pairs[one.pairs["method"] == "policy"]["rmse_speed"], policy)
+    np.testing.assert_allclose(without, policy, rtol=1e-9)
+    assert not np.allclose(learned.pairs[learned.pairs["method"] == "policy"]["rmse_speed"], policy)
 
 
 @pytest.mark.parametrize(
@@ -410,25 +402,19 @@ def test_less_history_is_what_the_plot_says(tmp_path: Path) -> None:
         ("default", 0.7, "default"),
     ],
 )
-def test_without_learning_the_policy_is_its_base(
-    tmp_path: Path, base: str, shrinkage: float, method: str
-) -> None:
-    still = [
-        "learner.epochs=1",
-        "learner.steps=1",
-        "learner.horizon=2",
-        "learner.ensemble_size=1",
-        "learner.learning_rate=1e-12",
-        "learner.weight_decay=0",
-    ]
-    start = [f"protocol.base={base}", f"protocol.shrinkage={shrinkage}"]
-    result = rollout(tmp_path, *start, "protocol.histories=[]", *still)
-    rmse = result.pairs.set_index(["method", "pair_id"])["rmse_speed"]
+def test_without_learning_the_policy_is_its_base(base: str, shrinkage: float, method: str) -> None:
+    still = RolloutLearner(
+        epochs=1, steps=1, horizon=2, ensemble_size=1, learning_rate=1e-12, weight_decay=0
+    )
+    protocol = AcrossDrivers(folds=2, base=base, shrinkage=shrinkage, histories=())
+    found = protocol.run(protocols.context(protocols.recording(), learner=still)).evaluation
+    rmse = found.table.set_index(["method", "pair_id"])["rmse_speed"]
     np.testing.assert_allclose(rmse["policy"], rmse[method], rtol=1e-5)
     # What drawing does on its own is shown where it was done.
-    assert ("shrunk" in rmse.index.get_level_values(0)) == (base == "own" and shrinkage > 0)
-    assert ("rmse_improvement/shrunk/mean" in result.metrics) == (base == "own" and shrinkage > 0)
-    assert not (tmp_path / "history.parquet").exists()
+    is_drawn = base == "own" and shrinkage > 0
+    assert ("shrunk" in rmse.index.get_level_values(0)) == is_drawn
+    assert ("rmse_improvement/shrunk/mean" in found.metrics()) == is_drawn
+    assert "history" not in found.tables
 
 
 def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> None:

@@ -16,10 +16,11 @@ from cfx.contracts import check_contract
 from cfx.core.errors import CfxError, DataError
 from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import Followers
-from cfx.evaluation.forecasts import Origins, simulate_from_origins
+from cfx.evaluation.forecasts import Origins
 from cfx.policies import checkpoint
 from cfx.simulation.rollout import MemoryStepper
 from cfx_forecasts.protocol import Forecast
+from tests.drives import simulate_from_origins
 from tests.evaluation.protocols.test_transfer import HERE, ROLLOUT, elsewhere, trained
 
 FORECAST = [
@@ -53,7 +54,9 @@ def job(base: list[str], run: Path, folder: Path, *overrides: str) -> cfx.JobRes
 
 
 def test_the_finished_policy_forecasts_from_every_moment(drawn: Path, tmp_path: Path) -> None:
-    result = job(FORECAST, drawn, tmp_path / "job", "protocol.samples=8", "model=w99")
+    result = job(
+        FORECAST, drawn, tmp_path / "job", "protocol.samples=3", "protocol.stride=4", "model=w99"
+    )
     config = yaml.safe_load((result.folder / "config.yaml").read_text())
     assert config["model"]["name"] == "krauss"
     assert len(pd.read_parquet(result.folder / "curves.parquet")) == 0

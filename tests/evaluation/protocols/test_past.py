@@ -33,7 +33,7 @@ QUICK = [
     "data.max_pairs=null",
     "data.pairs=16",
     "data.platoon_size=1",
-    "data.frames=200",
+    "data.frames=130",
     "figures.enabled=false",
     "tracking.enabled=false",
 ]

@@ -64,8 +64,9 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A job whose policy starts from drivers' own parameters."""
-    return trained(tmp_path_factory.mktemp("jobs") / "known", *ROLLOUT, "protocol.shrinkage=0.4")
+    """A job whose policy starts from drivers' own parameters, and has a residual."""
+    own = ["protocol.shrinkage=0.3", "learner.head=residual"]
+    return trained(tmp_path_factory.mktemp("jobs") / "known", *ROLLOUT, *own)
 
 
 @pytest.fixture(scope="module")
@@ -140,21 +141,13 @@ def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
 
 
 def test_it_starts_from_drivers_own_parameters_where_it_learned_so(
-    known: Path, unseen: Path, tmp_path: Path
+    known: Path, moved: cfx.JobResult, tmp_path: Path
 ) -> None:
-    assert "rmse_speed/shrunk" in transferred(known, tmp_path / "known").metrics
-    assert "rmse_speed/shrunk" not in transferred(unseen, tmp_path / "unseen").metrics
-
-
-def test_own_parameters_are_the_models_alone_where_the_policy_has_a_residual(
-    tmp_path: Path,
-) -> None:
-    residual = ["protocol.shrinkage=0.3", "learner.head=residual"]
-    job = trained(tmp_path / "job", *ROLLOUT, *residual)
-    result = transferred(job, tmp_path / "result")
-    metrics = result.metrics
+    """They are those of the model alone, also where the policy has a residual."""
+    metrics = transferred(known, tmp_path / "known").metrics
     assert metrics["rmse_speed/shrunk"] != metrics["rmse_speed/fixed"]
     assert metrics["rmse_speed/policy"] > 0.0
+    assert "rmse_speed/shrunk" not in moved.metrics
 
 
 def test_model_policy_and_windows_are_those_it_was_trained_with_and_drivers_of_the_same_names_count(
@@ -208,18 +201,9 @@ def test_what_it_has_learned_from_is_refused_whatever_it_is_called(
         replace(pair, recording="other", pair_id=f"x{pair.pair_id}", truth={}) for pair in seen[:4]
     )
     write_tidy(PairSet((*renamed, *elsewhere()), "both"), tmp_path / "renamed.csv")
-    tidy = [
-        *QUICK[1:2],
-        *QUICK[4:],
-        "data=tidy",
-        "data.min_frames=100",
-        "protocol=transfer",
-        f"protocol.run={unseen}",
-    ]
+    again = TidyDataset(path=tmp_path / "renamed.csv", min_frames=100).load()
     with pytest.raises(DataError, match="has learned from 4 of the 7 pairs"):
-        cfx.run(
-            [*tidy, f"data.path={tmp_path / 'renamed.csv'}", f"hydra.run.dir={tmp_path / 'again'}"]
-        )
+        Transfer(run=unseen).finished.check(again)
 
 
 def test_other_units_and_fewer_decimals_do_not_hide_what_it_has_learned_from(
@@ -243,25 +227,20 @@ def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_
     constant = trained(
         tmp_path / "constant", "policy=fixed", "protocol=across_drivers", "protocol.folds=2"
     )
+    seen = SyntheticDataset(pairs=6, platoon_size=1, frames=200, seed=5, max_pairs=3).load()
     with pytest.raises(DataError, match="has learned from 3 of the 3 pairs"):
-        transferred(constant, tmp_path, "data.seed=5", "data.pairs=6", "data.max_pairs=3")
+        Transfer(run=constant).finished.check(seen)
     there = transferred(constant, tmp_path)
     assert set(there.pairs["method"]) == {"default", "population", "fixed"}
 
 
-def test_other_time_steps_are_refused(unseen: Path, tmp_path: Path) -> None:
-    with pytest.raises(
-        DataError, match=r"drives in steps of 0.1 s, .* has 0.05 s; set data.time_step=0.1"
-    ):
-        transferred(unseen, tmp_path, "data.dt=0.05", "data.platoon_size=4")
-    assert transferred(
-        unseen,
-        tmp_path,
-        "data.dt=0.05",
-        "data.platoon_size=4",
-        "data.frames=400",
-        "data.time_step=0.1",
-    ).metrics
+def test_other_time_steps_are_refused(saved: Transfer) -> None:
+    pairs = elsewhere()
+    fast = PairSet(tuple(replace(pair, dt=0.05) for pair in pairs), "fast")
+    said = r"drives in steps of 0.1 s, fast has 0.05 s; set data.time_step=0.1"
+    with pytest.raises(DataError, match=said):
+        saved.finished.check(fast)
+    saved.finished.check(pairs)
 
 
 def test_runs_that_have_no_policy_for_others_are_refused(tmp_path: Path) -> None:
