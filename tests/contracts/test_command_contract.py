@@ -60,6 +60,6 @@ def test_a_module_that_imports_something_heavy_is_found() -> None:
     class Heavy(CiteCommand):
         pass
 
-    Heavy.__module__ = "cfx.learners.imitation"
-    with pytest.raises(AssertionError, match=r"import .*torch.* in `run`"):
+    Heavy.__module__ = "scipy"
+    with pytest.raises(AssertionError, match=r"import scipy in `run`"):
         checks.its_module_imports_nothing_heavy(Heavy())
