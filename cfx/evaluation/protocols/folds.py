@@ -10,7 +10,7 @@ Shapes: P pairs, K folds.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -48,7 +48,7 @@ def assign_folds(
         DataError: there are fewer drivers (platoons, ...) than folds, or one driver would be
             tested by a network that learned from them elsewhere.
     """
-    groups = _GROUPS[together](pairs)
+    groups = _groups(pairs, together)
     tested = []
     for number, pair in enumerate(pairs):
         if min_frames is None or len(pair) >= min_frames:
@@ -120,20 +120,13 @@ def _too_few(
     )
 
 
-def _drivers(pairs: PairSet) -> list[str]:
-    return [pair.driver for pair in pairs]
-
-
-def _recordings(pairs: PairSet) -> list[str]:
-    return [pair.recording for pair in pairs]
-
-
-def _vehicles(pairs: PairSet) -> list[str]:
-    return [pair.vehicle or pair.driver for pair in pairs]
-
-
-def _sites(pairs: PairSet) -> list[str]:
-    return [pair.site for pair in pairs]
+def _groups(pairs: PairSet, together: Together) -> Sequence[Any]:
+    """Returns what each pair's fold is chosen for."""
+    if together == "platoon":
+        return _platoons(pairs)
+    if together == "vehicle":
+        return [pair.vehicle or pair.driver for pair in pairs]
+    return [getattr(pair, together) for pair in pairs]
 
 
 def _platoons(pairs: PairSet) -> list[int]:
@@ -148,16 +141,6 @@ def _platoons(pairs: PairSet) -> list[int]:
     graph = coo_array(edges, shape=(len(vehicles), len(vehicles)))
     _, platoon = connected_components(graph, directed=False)
     return [int(platoon[index]) for index in columns]
-
-
-_GROUPS: Mapping[str, Callable[[PairSet], Sequence[Any]]] = {
-    "driver": _drivers,
-    "platoon": _platoons,
-    "vehicle": _vehicles,
-    "recording": _recordings,
-    "site": _sites,
-}
-"""What each pair's fold is chosen for: `protocol.together`."""
 
 
 def _leader(pair: Pair) -> str:
@@ -179,7 +162,7 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
     Returns:
         What `data.json` says of the folds.
     """
-    places = [int(number) for number in fold]
+    places = fold.tolist()
     fold_of_driver: dict[str, int] = {}
     for pair, place in zip(pairs, places, strict=True):
         if place >= 0:
@@ -187,7 +170,12 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
     behind_trained, leaders = _on_both_sides(pairs, places)
     folds = max(places) + 1
     tested = sum(place >= 0 for place in places)
-    recordings = _recordings_per_fold(pairs, places, folds)
+    recordings = []
+    for number in range(folds):
+        tested_there = zip(pairs, places, strict=True)
+        recordings.append(
+            sorted({pair.recording for pair, place in tested_there if place == number})
+        )
     log.info(
         "%d folds over %d drivers; %d of %d test pairs follow a driver of the training part,"
         " %d test drivers lead one there",
@@ -233,11 +221,3 @@ def _on_both_sides(pairs: PairSet, places: Sequence[int]) -> tuple[int, set[str]
         if leads_in is not None and place not in {leads_in, -2 - leads_in}:
             leaders.add(leader)
     return behind_trained, leaders
-
-
-def _recordings_per_fold(pairs: PairSet, places: Sequence[int], folds: int) -> list[list[str]]:
-    found: list[set[str]] = [set() for _ in range(folds)]
-    for pair, place in zip(pairs, places, strict=True):
-        if place >= 0:
-            found[place].add(pair.recording)
-    return [sorted(names) for names in found]

@@ -98,8 +98,6 @@ def record(
         Unsupported: the step is not elementwise, branches on values, has a very wide memory, or
             uses an operation that has no C++ counterpart here.
     """
-    from torch.fx.experimental.proxy_tensor import make_fx
-
     width = model.memory_size
     if width > _MOST_COLUMNS:
         raise Unsupported(f"a memory of {width} numbers")
@@ -124,15 +122,27 @@ def record(
         added = terms.function(after.speed, gap, *measured)
         return (after.position, after.speed, after.acceleration, after.memory, *added)
 
-    examples = []
-    for number in range(last + width):
-        examples.append(torch.full((VEHICLES,), 1.0 + number, dtype=dtype))
+    graph = _traced(step, last + width, dtype)
+    names = [*INPUTS, *parameter_names(len(parameters)), *memory_names(width)]
+    statements, (position, speed, acceleration, memory, *added) = _Recording(names).function(graph)
+    if len(memory) != width:
+        raise Unsupported("a memory that changes its width")
+    state = (position[0], speed[0], acceleration[0])
+    return StepProgram(statements, state, memory, tuple(term[0] for term in added))
+
+
+def _traced(
+    function: Callable[..., Sequence[Tensor]], inputs: int, dtype: torch.dtype, simpler: Any = None
+) -> fx.Graph:
+    """Returns the operations of a function of so many tensors `(V,)`."""
+    from torch.fx.experimental.proxy_tensor import make_fx
+
+    examples = [torch.full((VEHICLES,), 1.0 + number, dtype=dtype) for number in range(inputs)]
     try:
-        graph = make_fx(step)(*examples).graph
+        graph: fx.Graph = make_fx(function, simpler)(*examples).graph
     except Exception as error:
         raise Unsupported(f"recording it failed ({type(error).__name__})") from error
-    names = [*INPUTS, *parameter_names(len(parameters)), *memory_names(width)]
-    return _Recording(names).program(graph, width)
+    return graph
 
 
 class Program(NamedTuple):
@@ -163,7 +173,6 @@ def record_function(
         Unsupported: as `record`.
     """
     from torch._decomp import get_decompositions
-    from torch.fx.experimental.proxy_tensor import make_fx
 
     names: list[tuple[str, ...]] = []
     for number, width in enumerate(widths):
@@ -177,13 +186,9 @@ def record_function(
         return function(*arguments)
 
     flat = list(itertools.chain(*names))
-    examples = [torch.full((VEHICLES,), 1.0 + number, dtype=dtype) for number in range(len(flat))]
     wanted = (torch.ops.aten.logit, torch.ops.aten.lerp, torch.ops.aten.std)
     simpler: Any = get_decompositions(wanted)
-    try:
-        graph = make_fx(of_columns, simpler)(*examples).graph
-    except Exception as error:
-        raise Unsupported(f"recording it failed ({type(error).__name__})") from error
+    graph = _traced(of_columns, len(flat), dtype, simpler)
     if any(operation_of(node) == "detach" for node in graph.nodes):
         raise Unsupported("a gradient that is cut")
     statements, outputs = _Recording(flat).function(graph)
@@ -197,18 +202,6 @@ class _Recording:
         self._inputs = iter(inputs)
         self._statements: list[Statement] = []
         self._known: dict[fx.Node, Any] = {}
-
-    def program(self, graph: fx.Graph, width: int) -> StepProgram:
-        """Returns the whole step of a model whose memory has this width."""
-        statements, (position, speed, acceleration, memory, *terms) = self.function(graph)
-        if len(memory) != width:
-            raise Unsupported("a memory that changes its width")
-        return StepProgram(
-            statements=statements,
-            state=(position[0], speed[0], acceleration[0]),
-            memory=memory,
-            terms=tuple(term[0] for term in terms),
-        )
 
     def function(
         self, graph: fx.Graph
