@@ -189,7 +189,7 @@ class SpeedHuberSettings(Settings):
     )
 
 
-class SpeedHuber(Objective):
+class SpeedHuber(SpeedRmse):
     """Root of twice the mean Huber loss of speed, m/s: large errors weigh less than in an RMSE.
 
     P. J. Huber (1964), *Robust estimation of a location parameter*, Annals of Mathematical
@@ -201,10 +201,6 @@ class SpeedHuber(Objective):
 
     schema: ClassVar[type[Settings]] = SpeedHuberSettings
     settings: SpeedHuberSettings
-    unit = "m/s"
-    signals = ("speed",)
-    tie_tolerance = 0.05
-    floor = 0.2
 
     def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
         error = frames.speed - frames.measured_speed
@@ -212,9 +208,6 @@ class SpeedHuber(Objective):
             error, torch.zeros_like(error), reduction="none", delta=self.settings.delta
         )
         return (2.0 * losses,)
-
-    def finish(self, sums: tuple[Tensor, ...], count: Tensor, epsilon: float = 0.0) -> Tensor:
-        return root_mean_square(sums[0], count, epsilon)
 
 
 _LEAST_RMS = 1.0

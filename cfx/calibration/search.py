@@ -81,7 +81,7 @@ class RandomSearch(Optimizer):
         return blocks, losses
 
 
-class GradientSettings(Settings):
+class GradientSettings(RandomSettings):
     """Settings of `GradientSearch`."""
 
     samples: int = Field(
@@ -116,7 +116,7 @@ class GradientSettings(Settings):
         return self.starts
 
 
-class GradientSearch(Optimizer):
+class GradientSearch(RandomSearch):
     """Evaluates guesses and Sobol points, and searches locally from the best few.
 
     Each search is BFGS within the bounds. Slopes are differences towards the middle of the bounds,
@@ -134,13 +134,6 @@ class GradientSearch(Optimizer):
     schema: ClassVar[type[Settings]] = GradientSettings
     settings: GradientSettings
     trial: ClassVar[Mapping[str, Any]] = {"samples": 512}
-    in_threads = True
-
-    def evaluations(self) -> int:
-        return self.settings.samples
-
-    def evaluations_at_once(self) -> int:
-        return min(AT_ONCE, self.settings.samples)
 
     def space_filling(self) -> int:
         return self.settings.first

@@ -26,15 +26,22 @@ def root_mean_square(values: Tensor, counted: Tensor) -> Tensor:
     return (torch.where(counted, values, 0.0).square().sum(1) / counted.sum(1)).sqrt()
 
 
-class RmseSpeed(Metric):
+class ErrorMetric(Metric):
+    """Base of distances from the recording."""
+
+    direction = "lower"
+    is_error = True
+    headline = False
+
+
+class RmseSpeed(ErrorMetric):
     """Root mean square error of speed: sqrt(sum e^2 / K')."""
 
     unit = "m/s"
-    direction = "lower"
     heading = "RMSE speed"
     meaning = "root mean square difference between the simulated and the measured speed"
     scopes = ("test", "steady", "full_trajectory")
-    is_error = True
+    headline = True
     order = 1
 
     def compute(self, trajectories: Trajectories) -> Tensor:
@@ -42,17 +49,16 @@ class RmseSpeed(Metric):
         return root_mean_square(error, trajectories.counted)
 
 
-class RmseGap(Metric):
+class RmseGap(ErrorMetric):
     """Root mean square error of the gap: sqrt(sum e^2 / K')."""
 
     unit = "m"
-    direction = "lower"
     heading = "RMSE gap"
     meaning = (
         "root mean square difference between the simulated and the measured gap, bumper to bumper"
     )
     scopes = ("test", "full_trajectory")
-    is_error = True
+    headline = True
     order = 2
 
     def compute(self, trajectories: Trajectories) -> Tensor:
@@ -60,15 +66,12 @@ class RmseGap(Metric):
         return root_mean_square(error, trajectories.counted)
 
 
-class MaeSpeed(Metric):
+class MaeSpeed(ErrorMetric):
     """Mean absolute error of speed: sum |e| / K'."""
 
     unit = "m/s"
-    direction = "lower"
     heading = "MAE speed"
     meaning = "mean absolute difference between the simulated and the measured speed"
-    is_error = True
-    headline = False
     order = 11
 
     def compute(self, trajectories: Trajectories) -> Tensor:
@@ -76,15 +79,12 @@ class MaeSpeed(Metric):
         return masked_mean(error.abs(), trajectories.counted)
 
 
-class MaeGap(Metric):
+class MaeGap(ErrorMetric):
     """Mean absolute error of the gap: sum |e| / K'."""
 
     unit = "m"
-    direction = "lower"
     heading = "MAE gap"
     meaning = "mean absolute difference between the simulated and the measured gap"
-    is_error = True
-    headline = False
     order = 12
 
     def compute(self, trajectories: Trajectories) -> Tensor:
@@ -92,37 +92,31 @@ class MaeGap(Metric):
         return masked_mean(error.abs(), trajectories.counted)
 
 
-class NrmseSpeed(Metric):
+class NrmseSpeed(ErrorMetric):
     """Normalised RMSE of speed (Punzo et al. 2021): RMSE / sqrt(sum v^2 / K')."""
 
     unit = ""
-    direction = "lower"
     heading = "NRMSE speed"
     meaning = "RMSE of speed over the root mean square of the measured speed"
-    is_error = True
-    headline = False
     order = 13
 
     def compute(self, trajectories: Trajectories) -> Tensor:
         return _normalised(trajectories.speed, trajectories.measured_speed, trajectories.counted)
 
 
-class NrmseGap(Metric):
+class NrmseGap(ErrorMetric):
     """Normalised RMSE of the gap (Punzo et al. 2021): RMSE / sqrt(sum s^2 / K')."""
 
     unit = ""
-    direction = "lower"
     heading = "NRMSE gap"
     meaning = "RMSE of the gap over the root mean square of the measured gap"
-    is_error = True
-    headline = False
     order = 14
 
     def compute(self, trajectories: Trajectories) -> Tensor:
         return _normalised(trajectories.gap, trajectories.measured_gap, trajectories.counted)
 
 
-class RmseAcceleration(Metric):
+class RmseAcceleration(ErrorMetric):
     """Root mean square error of acceleration: sqrt(sum e^2 / K').
 
     Both accelerations are differences of successive speeds over the time step, so that the
@@ -130,11 +124,8 @@ class RmseAcceleration(Metric):
     """
 
     unit = "m/s2"
-    direction = "lower"
     heading = "RMSE acceleration"
     meaning = "root mean square difference between the simulated and the measured acceleration"
-    is_error = True
-    headline = False
     order = 15
 
     def compute(self, trajectories: Trajectories) -> Tensor:
@@ -142,7 +133,7 @@ class RmseAcceleration(Metric):
         return root_mean_square(error.diff(dim=1) / trajectories.dt, trajectories.counted[:, 1:])
 
 
-class TheilU(Metric):
+class TheilU(ErrorMetric):
     """Theil's inequality coefficient of speed.
 
     U = sqrt(sum e^2 / K') / (sqrt(sum v_sim^2 / K') + sqrt(sum v^2 / K')): from 0, no error, to 1.
@@ -152,11 +143,8 @@ class TheilU(Metric):
     """
 
     unit = ""
-    direction = "lower"
     heading = "Theil's U"
     meaning = "RMSE of speed over the sum of both root mean square speeds, from 0 to 1"
-    is_error = True
-    headline = False
     order = 16
 
     def compute(self, trajectories: Trajectories) -> Tensor:
@@ -166,7 +154,7 @@ class TheilU(Metric):
         return _ratio(root_mean_square(speed - measured, counted), size)
 
 
-class FinalPositionError(Metric):
+class FinalPositionError(ErrorMetric):
     """|x_sim - x| at the last frame that counts.
 
     Speed errors of opposite signs cancel in it and lasting ones add up. As both follow the same
@@ -174,11 +162,8 @@ class FinalPositionError(Metric):
     """
 
     unit = "m"
-    direction = "lower"
     heading = "final position error"
     meaning = "distance between the simulated and the real follower at the last frame"
-    is_error = True
-    headline = False
     order = 17
 
     def compute(self, trajectories: Trajectories) -> Tensor:
