@@ -21,12 +21,18 @@ MAY_CALL_THE_MODEL = ("simulation/step.py", "contracts/")
 """Besides the step itself: checks, which look at the model's answers one by one."""
 
 
+EQUATIONS = ("next_speed", "next_memory")
+
+
 def calls_of_the_model(path: Path) -> Iterator[int]:
     """Yields the lines that call a model's equations; a model may call another's to wrap it."""
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    text = path.read_text(encoding="utf-8")
+    if not any(name in text for name in EQUATIONS):
+        return
+    for node in ast.walk(ast.parse(text)):
         if not isinstance(node, ast.Call) or not isinstance(node.func, ast.Attribute):
             continue
-        if node.func.attr in {"next_speed", "next_memory"}:
+        if node.func.attr in EQUATIONS:
             yield node.lineno
 
 
