@@ -6,6 +6,7 @@ import itertools
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
+from functools import partial
 from typing import Literal, get_args, get_origin
 
 import torch
@@ -65,7 +66,8 @@ def _extreme(model: DrivingModel) -> _Step:
         p[parameter.name] = torch.where(corner[..., i], parameter.high, parameter.low).double()
     shape = (200, len(gap))
     position = (-gap - LENGTH).expand(shape)
-    follower = _follower(model, position, v.expand(shape), a.expand(shape))
+    speed = v.expand(shape)
+    follower = Follower(position, speed, a.expand(shape), model.initial_memory(speed))
     return follower, Leader(torch.zeros_like(gap), v_l, a_l, torch.full_like(gap, LENGTH)), p
 
 
@@ -186,7 +188,7 @@ def a_batch_equals_the_loop_over_it(model: DrivingModel) -> None:
     follower, leader, p = ordinary
     together = model.next_speed(follower, leader, p, DT)
     for k in range(DRIVES):
-        alone = model.next_speed(*_pick(ordinary, k), DT)
+        alone = model.next_speed(*_on_all(ordinary, partial(_of_one, k)), DT)
         expect_close(
             alone,
             together[k],
@@ -485,12 +487,6 @@ def _with_tuned(model: DrivingModel, tuned: Mapping[str, bool]) -> DrivingModel:
     return type(model)(**options)
 
 
-def _follower(
-    model: DrivingModel, position: Tensor, speed: Tensor, acceleration: Tensor
-) -> Follower:
-    return Follower(position, speed, acceleration, model.initial_memory(speed))
-
-
 def _states(model: DrivingModel, draw: torch.Generator) -> tuple[Follower, Leader]:
     def uniform(low: float, high: float) -> Tensor:
         return low + (high - low) * torch.rand(DRIVES, generator=draw, dtype=torch.float64)
@@ -498,7 +494,8 @@ def _states(model: DrivingModel, draw: torch.Generator) -> tuple[Follower, Leade
     gap, leader_speed = uniform(1, 40), uniform(1, 20)
     leader = Leader(uniform(100, 200), leader_speed, uniform(-1, 0.9), uniform(4, 6))
     speed = (leader_speed + uniform(-3, 3)).clamp(min=0.1)
-    return _follower(model, leader.position - leader.length - gap, speed, uniform(-1, 1)), leader
+    position, memory = leader.position - leader.length - gap, model.initial_memory(speed)
+    return Follower(position, speed, uniform(-1, 1), memory), leader
 
 
 def _stop_and_go(speed: Tensor, deceleration: float) -> Leader:
@@ -524,22 +521,21 @@ def _stop_and_go(speed: Tensor, deceleration: float) -> Leader:
     return Leader(position, v, acceleration, torch.full(speed.shape, LENGTH, dtype=torch.float64))
 
 
+def _on_all(step: _Step, change: Callable[[Tensor], Tensor]) -> _Step:
+    follower, leader, p = step
+    return (
+        Follower(*(change(x) for x in follower)),
+        Leader(*(change(x) for x in leader)),
+        {name: change(value) for name, value in p.items()},
+    )
+
+
+def _of_one(k: int, value: Tensor) -> Tensor:
+    return value[k] if value.dim() else value
+
+
 def _to(step: _Step, dtype: torch.dtype) -> _Step:
-    follower, leader, p = step
-    return (
-        Follower(*(x.to(dtype) for x in follower)),
-        Leader(*(x.to(dtype) for x in leader)),
-        {name: value.to(dtype) for name, value in p.items()},
-    )
-
-
-def _pick(step: _Step, k: int) -> _Step:
-    follower, leader, p = step
-    return (
-        Follower(*(x[k] for x in follower)),
-        Leader(*(x[k] for x in leader)),
-        {name: value[k] if value.dim() else value for name, value in p.items()},
-    )
+    return _on_all(step, lambda x: x.to(dtype))
 
 
 def _describe(step: _Step, wrong: Tensor) -> str:
