@@ -191,12 +191,9 @@ def wrapped(text: str) -> str:
 
 
 def side_by_side(figure: Figure, widths: Sequence[float], **more: Any) -> list[Axes]:
-    """Returns panels beside each other; on narrow paper each is as wide as the figure.
+    """Returns panels of relative widths beside each other; `more` as of `Figure.subplots`.
 
-    Args:
-        figure: an empty one; it becomes higher where panels stand one below the other.
-        widths: of the panels, relative.
-        more: as of `Figure.subplots`.
+    On narrow paper each is as wide as the figure, which becomes higher.
     """
     count = len(widths)
     if count == 1 or _PAPER.get().room >= 0.75:
@@ -249,9 +246,7 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
 def canvas(height: float, width: float = WIDTH) -> Figure:
     """Returns an empty figure that belongs to no pyplot state and no window.
 
-    Args:
-        height: on the usual paper, inches; on another it grows with the text.
-        width: on the usual paper, inches; on a narrow one it is as wide as the text needs.
+    Height and width are inches on the usual paper; on another they follow the text.
     """
     paper = _PAPER.get()
     share = width / WIDTH / min(1.0, paper.room)
@@ -283,14 +278,8 @@ def draw_points(
     axes: Axes, x: ArrayLike, y: ArrayLike, marker: str, colour: str, size: float, **more: Any
 ) -> Line2D:
     """Draw points without a line between them; `more` as of `Line2D`."""
-    style = {
-        "marker": marker,
-        "color": colour,
-        "markersize": points(size),
-        "linestyle": "none",
-        **more,
-    }
-    (drawn,) = axes.plot(x, y, **style)
+    style = {"marker": marker, "color": colour, "markersize": points(size), "linestyle": "none"}
+    (drawn,) = axes.plot(x, y, **{**style, **more})
     return drawn
 
 
@@ -335,13 +324,9 @@ def method_legend(figure: Figure, methods: Sequence[str], title: str | None = No
 def legend_above(
     figure: Figure, handles: Sequence[Artist] | None = None, columns: int = 3, **more: Any
 ) -> None:
-    """Puts a legend above a figure.
+    """Puts a legend above a figure, in so many columns at most; `more` as of `Figure.legend`.
 
-    Args:
-        figure: what it belongs to.
-        handles: its entries; None for what the figure's panels have labelled.
-        columns: at most so many.
-        more: as of `Figure.legend`.
+    Without `handles` its entries are what the figure's panels have labelled.
     """
     if handles is not None:
         columns = min(columns, max(len(handles), 1))

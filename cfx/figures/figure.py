@@ -35,10 +35,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class ParameterAxis:
-    """A tuned parameter: its name, its unit, and the bounds within which policies choose.
-
-    `meaning` says in words what it is.
-    """
+    """A tuned parameter: name, unit, bounds within which policies choose, and what it is."""
 
     name: str
     unit: str = ""

@@ -184,9 +184,6 @@ class Job:
         """Returns what the policy was compared with, driver-specific calibration first.
 
         It is empty if the job has another purpose.
-
-        Args:
-            scope: the part of the trajectories.
         """
         if self.purpose is not Purpose.ADAPTATION:
             return ()
@@ -265,12 +262,7 @@ class Job:
         )
 
     def statistics(self, baseline: str, scope: str = TEST) -> Improvement:
-        """Returns the improvement over a baseline; NaN where a statistic is not known.
-
-        Args:
-            baseline: one of `baselines`.
-            scope: the part of the trajectories.
-        """
+        """Returns the improvement over one of `baselines`; NaN where a statistic is not known."""
         statistics = {name: self.improvement(name, baseline, scope) for name in STATISTICS}
         known = self._improved(baseline, scope)
         undefined, drivers = len(self.by_pair) - known, self.by_pair["driver"].nunique()
@@ -343,12 +335,7 @@ _METRIC = TypeAdapter(MetricInfo)
 
 
 def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tuple[MetricInfo, ...]:
-    """Returns the metrics of a job, each with the scopes of which `metrics.json` has something.
-
-    Args:
-        data: what `data.json` holds.
-        metrics: what `metrics.json` holds.
-    """
+    """Returns the metrics of `data.json`, each with the scopes that `metrics.json` has some of."""
     listed = data.get("metrics")
     known = []
     for one in listed if isinstance(listed, list) else []:
@@ -364,10 +351,7 @@ def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tupl
 
 
 def read_job(origin: Origin) -> Job:
-    """Reads one finished job.
-
-    Args:
-        origin: its folder, and what is known besides.
+    """Reads one finished job, from its folder and what is known besides.
 
     Raises:
         DataError: a file cannot be read, or is not what a job writes.

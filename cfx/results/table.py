@@ -64,14 +64,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Findings:
-    """What a job has found, of which its tables are made.
-
-    Attributes:
-        pairs: of the job.
-        style: of its drivers.
-        protocol_result: what the protocol has delivered.
-        seed: of the job.
-    """
+    """What a job has found, of which its tables are made, and the job's seed."""
 
     pairs: PairSet
     style: StyleResult
@@ -185,12 +178,7 @@ class ResultTable(Component):
 
 @dataclass(frozen=True)
 class WrittenTable:
-    """A table that a job has written.
-
-    Attributes:
-        about: what it is, and who brings it.
-        rows: its rows; None if it is `large`.
-    """
+    """A table that a job has written; its rows are None if it is `large`."""
 
     about: registry.Installed[ResultTable]
     rows: pd.DataFrame | None

@@ -295,13 +295,7 @@ def place_of(folder: Path) -> str:
 
 @dataclass(frozen=True)
 class Computed:
-    """What a job has computed in this process.
-
-    Attributes:
-        config: its configuration, with what the protocol determined.
-        parts: its components.
-        findings: what it has found.
-    """
+    """What a job has computed in this process, with the configuration that the protocol completed."""
 
     config: JobConfig
     parts: Parts
