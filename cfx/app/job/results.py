@@ -295,7 +295,7 @@ def place_of(folder: Path) -> str:
 
 @dataclass(frozen=True)
 class Computed:
-    """What a job has computed in this process, with the configuration that the protocol completed."""
+    """What a job has computed in this process; the protocol has completed its configuration."""
 
     config: JobConfig
     parts: Parts
