@@ -18,7 +18,7 @@ from cfx.app.overrides import command_of
 from cfx.core import registry
 from cfx.core.errors import ConfigError, DataError, OutputError, listed
 from cfx.core.files import atomic_write, remove_leftovers, write_json
-from cfx.core.guest import guest, visit
+from cfx.core.guest import visit
 from cfx.core.job_folder import examine, parse_yaml, read_metrics
 from cfx.core.storage import RemoteFolder
 from cfx.data.style import StyleResult
@@ -467,7 +467,7 @@ def read_config(path: Path) -> JobConfig:
         raise DataError(f"{path} is no configuration of this version of cfx: {error}") from None
 
 
-@guest()
+@visit()
 def load(folder_or_run: str | Path) -> JobResult:
     """Reads a finished job back.
 
