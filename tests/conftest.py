@@ -23,6 +23,7 @@ from hypothesis import settings
 from omegaconf import OmegaConf
 
 from cfx.data.pairs import PairSet
+from cfx.data.tidy import TidyDataset
 from cfx.evaluation.platoon import Manoeuvre, measure_platoons
 from cfx.evaluation.protocols import held_out, within_driver
 from cfx.simulation.synthetic import SyntheticDataset
@@ -145,6 +146,13 @@ def shared_data() -> Path:
     if not folder.is_dir():
         pytest.skip(f"real recordings are not here ({folder}); see CONTRIBUTING.md")
     return folder
+
+
+@pytest.fixture(scope="session")
+def i80_pairs(shared_data: Path) -> PairSet:
+    """All pairs of the reconstructed recordings of I-80."""
+    path = shared_data / "i80_reconstructed_pairs.parquet"
+    return TidyDataset(path=path, min_frames=2, accelerations="recorded").load()
 
 
 class Installer:

@@ -8,9 +8,8 @@ from pathlib import Path
 import pytest
 from hydra.errors import MissingConfigException
 
-import cfx
 from cfx.app.user_errors import explain
-from cfx.core import extras, registry
+from cfx.core import errors, registry
 from cfx.core.errors import PluginError
 from tests.conftest import ROOT
 
@@ -39,18 +38,18 @@ def test_the_table_holds_what_the_plugins_here_bring() -> None:
             for option in options_of(folder):
                 brought[option] = folder.name
     own = {}
-    for option, where in extras.EXTRAS.items():
+    for option, where in errors.EXTRAS.items():
         distribution = where.partition("[")[0]
-        if distribution != extras.OWN:
+        if distribution != errors.OWN:
             own[option] = distribution
     assert own == brought
 
 
 def test_the_extras_are_those_of_pyproject() -> None:
-    for where in extras.EXTRAS.values():
+    for where in errors.EXTRAS.values():
         distribution, bracket, extra = where.partition("[")
         if bracket:
-            folder = ROOT if distribution == extras.OWN else ROOT / "plugins" / distribution
+            folder = ROOT if distribution == errors.OWN else ROOT / "plugins" / distribution
             text = (folder / "pyproject.toml").read_text("utf-8")
             assert extra.rstrip("]") in tomllib.loads(text)["project"]["optional-dependencies"]
 
@@ -86,6 +85,6 @@ def test_the_registry_says_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_outside_a_checkout_the_line_names_the_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(cfx, "__file__", str(tmp_path / "cfx" / "__init__.py"))
-    assert extras.install_line("cfx-cma").endswith(" install cfx-cma")
-    assert extras.install_line("cfx-driving[sumo]").endswith(' install "cfx-driving[sumo]"')
+    monkeypatch.setattr(errors, "__file__", str(tmp_path / "cfx" / "core" / "errors.py"))
+    assert errors.install_line("cfx-cma").endswith(" install cfx-cma")
+    assert errors.install_line("cfx-driving[sumo]").endswith(' install "cfx-driving[sumo]"')

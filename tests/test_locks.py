@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from filelock import FileLock, SoftFileLease, Timeout
@@ -15,14 +16,14 @@ from cfx.calibration.cache import Cache
 from cfx.core import files
 from cfx.core.files import is_shared, lock_for
 
-MOUNTS = """\
-/dev/sda1 / ext4 rw 0 0
-server:/home /home nfs4 rw 0 0
-/dev/sdb1 /home/local ext4 rw 0 0
-lustre /scratch\\040disk lustre rw 0 0
-s3 /mnt/bucket fuse.s3fs rw 0 0
-encfs /mnt/private fuse.encfs rw 0 0
-"""
+MOUNTS = {
+    "/": "ext4",
+    "/home": "nfs4",
+    "/home/local": "ext4",
+    "/scratch disk": "lustre",
+    "/mnt/bucket": "fuse.s3fs",
+    "/mnt/private": "fuse.encfs",
+}
 
 
 @pytest.mark.parametrize(
@@ -40,12 +41,8 @@ encfs /mnt/private fuse.encfs rw 0 0
 def test_network_file_systems_are_known_by_their_type(
     folder: str, expected: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read = Path.read_text
-    monkeypatch.setattr(
-        Path,
-        "read_text",
-        lambda path, **how: MOUNTS if str(path) == "/proc/self/mounts" else read(path, **how),
-    )
+    mounts = [SimpleNamespace(mountpoint=place, fstype=kind) for place, kind in MOUNTS.items()]
+    monkeypatch.setattr(files.psutil, "disk_partitions", lambda **_: mounts)
     assert is_shared(Path(folder)) is expected
 
 

@@ -17,6 +17,7 @@ from packaging.utils import canonicalize_name
 import cfx
 from cfx.app import nodes
 from cfx.core import registry
+from cfx.core.errors import OWN
 
 ROOT = Path(__file__).resolve().parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
@@ -39,9 +40,7 @@ def test_entry_points_of_pyproject_are_the_installed_ones() -> None:
     }
     for kind in (*registry.KINDS.values(), *registry.PARTS.values()):
         installed = {
-            (one.name, one.target)
-            for one in registry.entries(kind.name)
-            if one.distribution == registry.OWN
+            (one.name, one.target) for one in registry.entries(kind.name) if one.distribution == OWN
         }
         assert installed == declared.pop(kind.entry_points, set()), (
             "install again: pip install -e ."

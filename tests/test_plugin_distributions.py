@@ -24,7 +24,7 @@ PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.to
 READERS = {
     "cfx.data.files",
     "cfx.data.pairs",
-    "cfx.data.resample",
+    "cfx.data.signals",
     "cfx.data.sites",
     "cfx.data.table",
     "cfx.data.tidy",
@@ -47,7 +47,6 @@ RESULTS = {
     "cfx.core.component",
     "cfx.core.job_folder",
     "cfx.core.storage",
-    "cfx.data.site_styles",
     "cfx.data.style",
     "cfx.data.units",
     "cfx.evaluation.statistics",

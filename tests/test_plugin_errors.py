@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from cfx.app import cli
-from cfx.core.plugin_errors import blame
+from cfx.core.registry import blame
 from tests.broken_plugins import POLICY, QUICK
 
 Job = Callable[[str, str, str], tuple[int, str]]

@@ -42,7 +42,7 @@ def test_the_advice_to_use_a_file_can_be_pasted(tmp_path: Path) -> None:
     path = tmp_path / "it's 2 [pairs]=new.csv"
     pairs = wavy_pairs(Krauss(), TRUE, frames=60)
     frame_of(pairs).to_csv(path, index=False)
-    (line,) = (one for one in describe(path).splitlines() if one.startswith("Use it: "))
+    (line,) = (one for one in describe(path).text.splitlines() if one.startswith("Use it: "))
     words = shlex.split(line.removeprefix("Use it: "))
     override = OverridesParser.create().parse_override(words[1])
     assert override.key_or_group == "data.path"

@@ -51,8 +51,8 @@ from cfx.core.errors import (
 )
 from cfx.core.guest import guest, visit
 from cfx.core.memory import is_out_of_memory
-from cfx.core.plugin_errors import blame
 from cfx.core.processes import raise_if_terminated, signal_behind, terminable
+from cfx.core.registry import blame
 from cfx.core.storage import is_url
 
 if TYPE_CHECKING:

@@ -82,7 +82,7 @@ def _command(name: str, *arguments: str) -> int:
         PluginError: it cannot be loaded, two distributions claim its name, or its code failed.
     """
     from cfx.core import registry
-    from cfx.core.extras import EXTRAS
+    from cfx.core.errors import EXTRAS
 
     action = ".".join((name, *arguments[:1]))
     if action in registry.names("command") or ("command", action) in EXTRAS:
@@ -97,7 +97,7 @@ def _command(name: str, *arguments: str) -> int:
     except (CfxError, OSError):
         raise
     except Exception as error:
-        from cfx.core.plugin_errors import blame
+        from cfx.core.registry import blame
 
         blamed = blame(error, "CFX_TRACEBACK=1 shows the whole traceback")
         if blamed is None:

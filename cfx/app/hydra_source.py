@@ -33,7 +33,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from cfx.app import nodes
 from cfx.core import registry
-from cfx.core.errors import PluginError
+from cfx.core.errors import OWN, PluginError
 
 if TYPE_CHECKING:
     from cfx.core.command import Command
@@ -148,7 +148,7 @@ def listed_commands() -> str:
         try:
             about = cast("type[Command]", registry.get("command", name)).summary
             distribution = registry.entry("command", name).distribution
-            if distribution != registry.OWN:
+            if distribution != OWN:
                 about = f"{about} (from {distribution})".strip()
         except PluginError as error:  # it cannot be imported, or two distributions bring it
             about = str(error)

@@ -23,7 +23,7 @@ from pydantic_core import to_jsonable_python
 import cfx
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import CfxError
+from cfx.core.errors import OWN, CfxError
 from cfx.core.parameters import Parameter, ParameterSpace
 
 _WIDTH = 100
@@ -92,7 +92,7 @@ def built_in() -> list[registry.Entry]:
         if not about.chosen:
             continue
         for entry in registry.entries(kind):
-            if entry.distribution == registry.OWN:
+            if entry.distribution == OWN:
                 found.append(entry)
     return found
 

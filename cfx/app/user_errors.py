@@ -16,8 +16,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cfx.app import hydra_source
 from cfx.core import registry
-from cfx.core.errors import CfxError, ConfigError, listed, nearest
-from cfx.core.extras import advice
+from cfx.core.errors import CfxError, ConfigError, advice, listed, nearest
 
 
 def is_user_error(error: BaseException) -> bool:

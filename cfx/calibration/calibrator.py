@@ -23,7 +23,7 @@ from torch import Tensor
 from cfx.calibration.cache import Arrays, Cache, first_fit
 from cfx.calibration.objectives import Objective
 from cfx.calibration.shards import CalibrationShard, PooledShard, SegmentShard, Solver
-from cfx.core import scratch
+from cfx.core import memory
 from cfx.core.component import content_key
 from cfx.core.engine import Engine
 from cfx.core.local_engine import LocalEngine
@@ -316,7 +316,7 @@ class Calibrator:
             for name, objective in self.reported.items():
                 loss = objective(frames, losses.segments.counted[..., None])
                 means[name] += float(loss.sum()) / len(pair)
-            scratch.release()
+            memory.release()
         return means
 
     def _where_it_is_fast(self, batch: PairBatch) -> PairBatch:

@@ -22,7 +22,7 @@ from torch import Tensor
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.objectives import GapRmse, Objective, SpeedRmse
-from cfx.core import scratch
+from cfx.core import memory
 from cfx.data.pairs import PairBatch
 
 PLACES = 21
@@ -110,7 +110,7 @@ def losses_of(
         size = max(1, calibrator.solver.memory // max(1, per_pair))
         for some in torch.split(torch.arange(len(own), device=own.device), size):
             parts.append(segments.take(some)(candidates[own[some]]))
-        scratch.release()
+        memory.release()
     return torch.cat(parts)
 
 

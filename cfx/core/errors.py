@@ -3,8 +3,16 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
-from collections.abc import Iterable
+import shlex
+import shutil
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+OWN = "cfx-driving"
+"""cfx's own distribution: no other can replace its components."""
 
 
 class CfxError(Exception):
@@ -91,6 +99,12 @@ def nearest(name: str, choices: Iterable[str]) -> str:
     return f" Did you mean '{close[0]}'?"
 
 
+def first_line(error: BaseException) -> str:
+    """Returns the first line of an error's text; its type's name where it has none."""
+    lines = (line.strip() for line in str(error).splitlines())
+    return next((line for line in lines if line), type(error).__name__)
+
+
 def listed(values: Iterable[object], limit: int = 12) -> str:
     """Returns the values separated by commas, cut off after `limit` of them."""
     texts = [str(value) for value in values]
@@ -98,3 +112,117 @@ def listed(values: Iterable[object], limit: int = 12) -> str:
     if len(texts) > limit:
         text += f", ... ({len(texts)} in all)"
     return text
+
+
+_BROUGHT: dict[str, dict[str, tuple[str, ...]]] = {
+    "cfx-benchmark": {"command": ("benchmark", "policies.make")},
+    "cfx-botorch": {"optimizer": ("botorch",)},
+    "cfx-classics": {"model": ("fvdm", "gipps", "gipps_delay", "newell", "ovm", "ovm_city")},
+    "cfx-cma": {"optimizer": ("cma",)},
+    "cfx-dask": {"engine": ("dask",), "hydra/launcher": ("dask",)},
+    f"{OWN}[joblib]": {"hydra/launcher": ("joblib",)},
+    f"{OWN}[submitit]": {"hydra/launcher": ("submitit_local", "submitit_slurm")},
+    "cfx-estimators": {"policy": ("particle_filter", "recalibrate", "ukf")},
+    "cfx-fmi": {"export": ("fmi",)},
+    "cfx-forecasts": {
+        "experiment": ("forecast", "stochastic"),
+        "protocol": ("forecast",),
+        "table": ("distributions", "forecasts"),
+    },
+    "cfx-idm": {"model": ("idm_city", "iidm")},
+    "cfx-mlflow": {"command": ("ui",), "tracking.name": ("mlflow",)},
+    "cfx-onnx": {"export": ("onnx",)},
+    "cfx-posteriors": {
+        "calibration.posterior": ("hierarchical", "laplace", "nuts"),
+        "export": ("netcdf",),
+        "table": ("fan", "population", "posterior", "prior"),
+    },
+    "cfx-posteriors[sbi]": {"calibration.posterior": ("sbi",)},
+    "cfx-recordings": {
+        "command": ("data.fetch",),
+        "data": (
+            "followernet",
+            "follownet",
+            "highd",
+            "lyft_pairs",
+            "ngsim",
+            "openacc",
+            "waymo_pairs",
+        ),
+    },
+    "cfx-report": {"command": ("figures", "report")},
+    "cfx-scipy": {"optimizer": ("differential_evolution",)},
+    "cfx-sumo": {
+        "command": ("drive",),
+        "data": ("sumo_fcd",),
+        "demo": ("sumo",),
+        "experiment": ("sumo_demo",),
+        "export": ("sumo",),
+        "model": ("eidm", "sumo_vtype"),
+        "simulator": ("sumo",),
+    },
+    "cfx-tcn": {"policy": ("tcn",)},
+    "cfx-traffic": {
+        "experiment": ("traffic",),
+        "protocol": ("traffic",),
+        "table": ("traffic", "traffic_growth", "traffic_paths", "traffic_strips"),
+    },
+}
+"""Options that come with another distribution or an extra, by group."""
+
+EXTRAS = {
+    (group, name): wanted
+    for wanted, groups in _BROUGHT.items()
+    for group, options in groups.items()
+    for name in options
+}
+"""What brings an option, by its group and name."""
+
+
+def advice(group: str, name: str, known: Sequence[str]) -> str:
+    """Returns advice on a missing option: install it, or choose another.
+
+    Args:
+        group: such as `model`.
+        name: what was asked for.
+        known: the options that are installed.
+    """
+    if (group, name) in EXTRAS:
+        wanted = EXTRAS[group, name]
+        return f" It comes with {wanted}: {install_line(wanted)}"
+    others = [option for where, option in EXTRAS if where == group]
+    text = nearest(name, [*known, *others])
+    if known:
+        text += f" Known: {', '.join(known)}."
+    return text
+
+
+def install_line(wanted: str) -> str:
+    """Returns the command that installs a distribution, or an extra of cfx's, for this Python.
+
+    In a checkout it is the folder's: `pip install --editable plugins/cfx-classics`.
+    """
+    name, bracket, extra = wanted.partition("[")
+    checkout = Path(__file__).resolve().parents[2]
+    if name != OWN:
+        checkout = checkout / "plugins" / name
+    source = shlex.quote(wanted)
+    if bracket:
+        source = f'"{wanted}"'
+    if (checkout / "pyproject.toml").is_file():
+        source = f"--editable {shlex.quote(_from_here(checkout) + bracket + extra)}"
+    return f"{_pip()} install {source}"
+
+
+def _pip() -> str:
+    """Returns `pip`, or how to call this Python's where the shell has another."""
+    found = shutil.which("pip")
+    if found is not None and Path(found).parent == Path(sys.executable).parent:
+        return "pip"
+    return f"{shlex.quote(_from_here(Path(sys.executable)))} -m pip"
+
+
+def _from_here(path: Path) -> str:
+    """Returns a path from the working directory on, if it lies there, else the whole one."""
+    inside = path.is_relative_to(Path.cwd())
+    return os.path.relpath(path) if inside else str(path)

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
+import psutil  # type: ignore[import-untyped]  # it ships no types
 from filelock import BaseFileLock, FileLock, SoftFileLease
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
@@ -197,16 +198,9 @@ def is_shared(folder: Path) -> bool:
 
 def _file_system(folder: Path) -> str:
     """Returns the type of the file system on which a folder lies, "" where it is unknown."""
-    try:
-        mounts = Path("/proc/self/mounts").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        return ""
-    whole = str(folder.absolute())
     best, kind = "", ""
-    for line in mounts:
-        _, place, found, *_ = line.split()
-        place = place.replace("\\040", " ")
-        inside = whole == place or whole.startswith(place.rstrip("/") + "/")
-        if inside and len(place) >= len(best):
-            best, kind = place, found
+    for mount in psutil.disk_partitions(all=True):
+        place = mount.mountpoint
+        if folder.absolute().is_relative_to(place) and len(place) >= len(best):
+            best, kind = place, mount.fstype
     return kind

@@ -15,13 +15,15 @@ import signal
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from cfx.core.threads import cores_limit, limit_cores
 
-_Undo = Callable[[], None]
+_Part = tuple[Callable[[], Any], Callable[[Any], object]]
+"""How a part of the state is read, and how it is put back."""
 
 
 @contextlib.contextmanager
@@ -33,13 +35,13 @@ def guest() -> Iterator[None]:
     gradient mode and deterministic flags, cfx's limit of cores, Hydra's singletons, MLflow's
     tracking URI. MLflow's autologging rests meanwhile: training is no run of the caller's.
     """
-    undo = [kept() for kept in _KEPT]
+    before = [(put_back, read()) for read, put_back in _parts()]
     try:
         with warnings.catch_warnings(), _own_hydra(), _no_autologging():
             yield
     finally:
-        for put_back in reversed(undo):
-            put_back()
+        for put_back, value in reversed(before):
+            put_back(value)
 
 
 @contextlib.contextmanager
@@ -48,11 +50,11 @@ def same_environment() -> Iterator[None]:
 
     PyTorch's compiler names its cache in one.
     """
-    put_back = _environment()
+    before = dict(os.environ)
     try:
         yield
     finally:
-        put_back()
+        _put_environment(before)
 
 
 @contextlib.contextmanager
@@ -90,167 +92,112 @@ def visit() -> Iterator[None]:
         yield
 
 
-def _environment() -> _Undo:
-    before = dict(os.environ)
-
-    def put_back() -> None:
-        for name in set(os.environ) - set(before):
-            del os.environ[name]
-        for name, value in before.items():
-            if os.environ.get(name) != value:
-                os.environ[name] = value
-
-    return put_back
-
-
-def _working_directory() -> _Undo:
-    before = Path.cwd()
-
-    def put_back() -> None:
-        with contextlib.suppress(OSError):  # the caller's folder may have gone meanwhile
-            if Path.cwd() == before:
-                return
-        with contextlib.suppress(OSError):
-            os.chdir(before)
-
-    return put_back
-
-
-def _arguments() -> _Undo:
-    before, values = sys.argv, list(sys.argv)
-
-    def put_back() -> None:
-        sys.argv = before
-        sys.argv[:] = values
-
-    return put_back
-
-
-def _random_state() -> _Undo:
-    before = random.getstate()
+def _parts() -> Iterator[_Part]:
+    """Yields the parts of the state; later ones are put back first."""
+    yield os.environ.copy, _put_environment
+    yield Path.cwd, _put_directory
+    yield lambda: (sys.argv, sys.argv[:]), _put_arguments
+    yield random.getstate, random.setstate
     numpy = sys.modules.get("numpy")
-    of_numpy = None if numpy is None else numpy.random.get_state()
-
-    def put_back() -> None:
-        random.setstate(before)
-        if numpy is not None:
-            numpy.random.set_state(of_numpy)
-
-    return put_back
-
-
-def _cores() -> _Undo:
-    before = cores_limit()
-    return lambda: limit_cores(before)
-
-
-def _signal_handlers() -> _Undo:
-    before = {number: signal.getsignal(number) for number in signal.valid_signals()}
-
-    def put_back() -> None:
-        if threading.current_thread() is not threading.main_thread():
-            return  # no other thread can change a handler either
-        for number, handler in before.items():
-            # None: C code has set it, and Python cannot put it back.
-            if handler is not None and signal.getsignal(number) != handler:
-                signal.signal(number, handler)
-
-    return put_back
+    if numpy is not None:
+        yield numpy.random.get_state, numpy.random.set_state
+    yield cores_limit, limit_cores
+    yield lambda: {one: signal.getsignal(one) for one in signal.valid_signals()}, _put_handlers
+    yield _logging, _put_logging
+    torch = sys.modules.get("torch")
+    if torch is not None:
+        yield from _torch_parts(torch)
+    mlflow = sys.modules.get("mlflow")
+    if mlflow is not None:  # after the environment, one of whose variables it is too
+        yield _if_changed(
+            lambda: mlflow.get_tracking_uri() if mlflow.is_tracking_uri_set() else None,
+            mlflow.set_tracking_uri,
+        )
 
 
-def _logging() -> _Undo:
-    """Keeps every logger that there is; handlers that the block adds to one are closed."""
+def _torch_parts(torch: Any) -> Iterator[_Part]:
+    yield torch.get_num_threads, torch.set_num_threads
+    yield torch.get_default_dtype, torch.set_default_dtype
+    yield torch.is_grad_enabled, torch.set_grad_enabled
+    yield torch.get_rng_state, torch.set_rng_state
+    if torch.cuda.is_initialized():
+        yield torch.cuda.get_rng_state_all, torch.cuda.set_rng_state_all
+    yield _if_changed(  # setting it imports PyTorch's compiler: seconds
+        lambda: (
+            torch.are_deterministic_algorithms_enabled(),
+            torch.is_deterministic_algorithms_warn_only_enabled(),
+        ),
+        lambda flags: torch.use_deterministic_algorithms(flags[0], warn_only=flags[1]),
+    )
+    yield _if_changed(torch.get_float32_matmul_precision, torch.set_float32_matmul_precision)
+    for flag in ("benchmark", "deterministic"):
+        cudnn = torch.backends.cudnn
+        yield partial(getattr, cudnn, flag), partial(setattr, cudnn, flag)
+
+
+def _if_changed(read: Callable[[], Any], put_back: Callable[[Any], object]) -> _Part:
+    """Returns a part that is put back only where it has changed."""
+
+    def put(value: Any) -> None:
+        if read() != value:
+            put_back(value)
+
+    return read, put
+
+
+def _put_environment(before: Mapping[str, str]) -> None:
+    for name in set(os.environ) - set(before):
+        del os.environ[name]
+    for name, value in before.items():
+        if os.environ.get(name) != value:
+            os.environ[name] = value
+
+
+def _put_directory(before: Path) -> None:
+    with contextlib.suppress(OSError):  # the caller's folder may have gone meanwhile
+        os.chdir(before)
+
+
+def _put_arguments(before: tuple[list[str], list[str]]) -> None:
+    sys.argv, values = before
+    sys.argv[:] = values
+
+
+def _put_handlers(before: Mapping[int, Any]) -> None:
+    if threading.current_thread() is not threading.main_thread():
+        return  # no other thread can change a handler either
+    for number, handler in before.items():
+        # None: C code has set it, and Python cannot put it back.
+        if handler is not None and signal.getsignal(number) != handler:
+            signal.signal(number, handler)
+
+
+def _logging() -> Any:
+    """Returns the level below which all is off, and each logger with what it consists of."""
     loggers = [logging.getLogger()]
     for logger in logging.getLogger().manager.loggerDict.values():
         if isinstance(logger, logging.Logger):
             loggers.append(logger)
-    lists = [(logger.handlers[:], logger.filters[:]) for logger in loggers]
-    flags = [(logger.level, logger.disabled, logger.propagate) for logger in loggers]
-    disabled_below = logging.getLogger().manager.disable
-
-    def put_back() -> None:
-        if logging.getLogger().manager.disable != disabled_below:
-            logging.disable(disabled_below)
-        for logger, (handlers, filters), flag in zip(loggers, lists, flags, strict=True):
-            added = [handler for handler in logger.handlers if handler not in handlers]
-            logger.handlers[:] = handlers
-            logger.filters[:] = filters
-            level, logger.disabled, logger.propagate = flag
-            if logger.level != level:
-                logger.setLevel(level)
-            for handler in added:
-                handler.close()
-
-    return put_back
+    parts = []
+    for one in loggers:
+        flags = (one.level, one.disabled, one.propagate)
+        parts.append((one, one.handlers[:], one.filters[:], flags))
+    return logging.getLogger().manager.disable, parts
 
 
-def _torch() -> _Undo:
-    torch = sys.modules.get("torch")
-    if torch is None:
-        return lambda: None
-    threads, dtype = torch.get_num_threads(), torch.get_default_dtype()
-    gradients, state = torch.is_grad_enabled(), torch.get_rng_state()
-    of_gpus = torch.cuda.get_rng_state_all() if torch.cuda.is_initialized() else None
-    deterministic = _deterministic(torch)
-    cudnn = torch.backends.cudnn
-    flags = (cudnn.benchmark, cudnn.deterministic)
-    precision = torch.get_float32_matmul_precision()
-
-    def put_back() -> None:
-        torch.set_num_threads(threads)
-        torch.set_default_dtype(dtype)
-        torch.set_grad_enabled(gradients)
-        torch.set_rng_state(state)
-        if of_gpus is not None:
-            torch.cuda.set_rng_state_all(of_gpus)
-        if _deterministic(torch) != deterministic:  # setting it imports PyTorch's compiler: seconds
-            torch.use_deterministic_algorithms(deterministic[0], warn_only=deterministic[1])
-        cudnn.benchmark, cudnn.deterministic = flags
-        if torch.get_float32_matmul_precision() != precision:
-            torch.set_float32_matmul_precision(precision)
-
-    return put_back
-
-
-def _deterministic(torch: Any) -> tuple[bool, bool]:
-    """Returns whether PyTorch keeps to deterministic algorithms, and whether it only warns."""
-    is_on: bool = torch.are_deterministic_algorithms_enabled()
-    only_warns: bool = torch.is_deterministic_algorithms_warn_only_enabled()
-    return is_on, only_warns
-
-
-def _mlflow() -> _Undo:
-    """Keeps the tracking URI; in the environment it is put back with the environment."""
-    mlflow = sys.modules.get("mlflow")
-    if mlflow is None:
-        return lambda: None
-
-    def uri() -> str | None:
-        if mlflow.is_tracking_uri_set():
-            return str(mlflow.get_tracking_uri())
-        return None
-
-    before = uri()
-
-    def put_back() -> None:
-        if uri() != before:
-            mlflow.set_tracking_uri(before)
-
-    return put_back
-
-
-# Later ones are put back first: MLflow's URI is one of the environment's variables too.
-_KEPT: tuple[Callable[[], _Undo], ...] = (
-    _environment,
-    _working_directory,
-    _arguments,
-    _random_state,
-    _cores,
-    _signal_handlers,
-    _logging,
-    _torch,
-    _mlflow,
-)
+def _put_logging(before: Any) -> None:
+    """Puts every logger back that there was; handlers that the block has added are closed."""
+    disabled_below, parts = before
+    if logging.getLogger().manager.disable != disabled_below:
+        logging.disable(disabled_below)
+    for logger, handlers, filters, (level, disabled, propagate) in parts:
+        added = [handler for handler in logger.handlers if handler not in handlers]
+        logger.handlers[:], logger.filters[:] = handlers, filters
+        logger.disabled, logger.propagate = disabled, propagate
+        if logger.level != level:
+            logger.setLevel(level)
+        for handler in added:
+            handler.close()
 
 
 @contextlib.contextmanager

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from cfx.core.errors import DataError
+from cfx.core.errors import DataError, first_line, without_passwords
 
 _LARGEST_MB = 256
 """Texts and weights of a job are smaller."""
@@ -94,7 +94,7 @@ def parse_yaml(text: str) -> Any:
         # The loader is PyYAML's safe one, without aliases.
         values = yaml.load(text, Loader=_PlainLoader)  # noqa: S506
     except yaml.YAMLError as error:
-        raise ValueError(next(iter(str(error).splitlines()), "no YAML")) from error
+        raise ValueError(first_line(error)) from error
     except RecursionError:
         raise _too_deep() from None
     _check_depth(values)
@@ -103,11 +103,7 @@ def parse_yaml(text: str) -> Any:
 
 def unreadable(path: Path, error: Exception) -> DataError:
     """Returns the error that a file of a job cannot be read, with the first line of the reason."""
-    reason = type(error).__name__
-    for line in str(error).splitlines():
-        if line.strip():
-            reason = line.strip()
-            break
+    reason = first_line(error)
     return DataError(f"{path} cannot be read ({reason}); run the job again, or leave it out")
 
 
@@ -143,7 +139,6 @@ T = TypeVar("T")
 
 _FOLDERS = re.compile(r"(?<![\w.~:/-])/(?:[^/\s'\",\]]+/)+")
 _OF_DATABASE = re.compile(r"(sqlite:///)/(?:[^/\s'\",\]]+/)+")
-_PASSWORD = re.compile(r"(://[^/@\s:]*):[^/@\s]+@")
 
 
 def optional(path: Path, read: Callable[[Path], T]) -> T | None:
@@ -186,18 +181,18 @@ def read_yaml_list(path: Path) -> list[Any]:
     return list(content) if isinstance(content, list) else []
 
 
-def _mapping(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
-    content = _parsed(path, parse)
-    if not isinstance(content, dict):
-        raise DataError(f"{path} is damaged: it holds no mapping of names to values")
-    return content
-
-
 def _parsed(path: Path, parse: Callable[[str], Any]) -> Any:
     try:
         return parse(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise unreadable(path, error) from error
+
+
+def _mapping(path: Path, parse: Callable[[str], Any]) -> dict[str, Any]:
+    content = _parsed(path, parse)
+    if not isinstance(content, dict):
+        raise DataError(f"{path} is damaged: it holds no mapping of names to values")
+    return content
 
 
 def public(values: Mapping[str, Any]) -> dict[str, Any]:
@@ -211,15 +206,10 @@ def _clean(value: Any) -> Any:
     if isinstance(value, list):
         return [_clean(part) for part in value]
     if isinstance(value, str):
-        return without_password(value)
+        return without_passwords(value)
     return value
 
 
 def without_folders(text: str) -> str:
     """Returns a text without the folders of absolute paths, which nobody else has."""
     return _OF_DATABASE.sub(r"\1", _FOLDERS.sub("", text))
-
-
-def without_password(text: str) -> str:
-    """Returns a text with three stars for passwords in `postgresql://name:password@host`."""
-    return _PASSWORD.sub(r"\1:***@", text)

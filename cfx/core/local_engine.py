@@ -34,8 +34,6 @@ class LocalEngine(Engine):
             for number, shard in enumerate(shards):
                 yield number, work(shard, report)
             return
-        # Imported where it is used: most work needs no other process.
-
         yield from in_processes(work, shards, report, cores())
 
 
@@ -98,7 +96,7 @@ def _work_along(
         yield number, result
         yield from workers.finished()
         workers.hand_out(source)
-    while workers.are_busy:
+    while workers.running:
         workers.wait()
         yield from workers.finished()
         workers.hand_out(source)
@@ -106,13 +104,7 @@ def _work_along(
 
 
 class _Workers(Generic[ShardT, ResultT]):
-    """Other processes, each at one shard.
-
-    Args:
-        work: what they do.
-        report: called with their progress.
-        count: how many at most.
-    """
+    """Other processes, each at one shard."""
 
     def __init__(self, work: Work[ShardT, ResultT], report: Report, count: int) -> None:
         self._units = get_context("loky").SimpleQueue()
@@ -120,21 +112,17 @@ class _Workers(Generic[ShardT, ResultT]):
         self._work = work
         self._report = report
         self._count = count
-        self._running: dict[Future[ResultT], int] = {}
+        self.running: dict[Future[ResultT], int] = {}
+        """Results that are still to come or to be fetched, and the numbers of their shards."""
         # They import what they need while the first shard is made here.
         for _ in range(count):
             self._pool.submit(_import, work)
 
-    @property
-    def are_busy(self) -> bool:
-        """Whether some of their results are still to come, or to be fetched."""
-        return bool(self._running)
-
     def hand_out(self, source: Iterator[tuple[int, ShardT]]) -> None:
         """Gives a shard to each worker that is free."""
-        busy = sum(not future.done() for future in self._running)
+        busy = sum(not future.done() for future in self.running)
         for number, shard in itertools.islice(source, self._count - busy):
-            self._running[self._pool.submit(_do, self._work, shard)] = number
+            self.running[self._pool.submit(_do, self._work, shard)] = number
 
     def report(self, units: int) -> None:
         """Reports the units done here, and those that workers have done since."""
@@ -144,7 +132,7 @@ class _Workers(Generic[ShardT, ResultT]):
 
     def check(self) -> None:
         """Raises the error of a worker whose result is not fetched yet."""
-        for future in self._running:
+        for future in self.running:
             if future.done():
                 future.result()
 
@@ -152,13 +140,13 @@ class _Workers(Generic[ShardT, ResultT]):
         """Waits until one of them has a result."""
         done: set[Future[ResultT]] = set()
         while not done:
-            done, _ = wait(self._running, timeout=_LOOK, return_when=FIRST_COMPLETED)
+            done, _ = wait(self.running, timeout=_LOOK, return_when=FIRST_COMPLETED)
             self.report(0)
 
     def finished(self) -> Iterator[tuple[int, ResultT]]:
         """Yields the results that have arrived."""
-        for future in [one for one in self._running if one.done()]:
-            number = self._running.pop(future)
+        for future in [one for one in self.running if one.done()]:
+            number = self.running.pop(future)
             yield number, future.result()
 
     def end(self, *, kill: bool) -> None:

@@ -92,11 +92,7 @@ _WIDEST = 100.0
 
 
 def _require_possible(declared: Parameter, key: str, low: float | None, high: float | None) -> None:
-    """Raises ParameterError for bounds of another sign than a model's, or far beyond them.
-
-    Args:
-        key: the setting that gives them.
-    """
+    """Raises ParameterError for bounds of another sign than a model's, or far beyond them."""
     most = _WIDEST * max(abs(declared.low), abs(declared.high))
     wrong = ""
     for value in (low, high):

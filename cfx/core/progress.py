@@ -11,8 +11,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from importlib import import_module
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, Self
 from uuid import uuid4
 
 from rich.console import Console
@@ -46,16 +45,6 @@ def no_bars_on_terminals() -> Iterator[None]:
         _ON_TERMINALS.reset(before)
 
 
-class _Bar(Protocol):
-    """What draws progress."""
-
-    def draw(self, done: int) -> None:
-        """Shows that so many units are done."""
-
-    def close(self) -> None:
-        """Takes the bar away."""
-
-
 class _TerminalBar:
     """A line at the bottom of a terminal."""
 
@@ -67,25 +56,15 @@ class _TerminalBar:
             TimeElapsedColumn(),
             TimeRemainingColumn(),
         )
-        self._progress = Progress(*columns, console=console, transient=True)
-        self._progress.start()
-        self._task = self._progress.add_task(description, total=total)
-
-    def draw(self, done: int) -> None:
-        self._progress.update(self._task, completed=done)
-
-    def close(self) -> None:
-        self._progress.stop()
+        progress = Progress(*columns, console=console, transient=True)
+        progress.start()
+        task = progress.add_task(description, total=total)
+        self.draw = lambda done: progress.update(task, completed=done)
+        self.close = progress.stop
 
 
 class _NotebookBar:
-    """A bar below a notebook's cell, by IPython alone: rich's and tqdm's need ipywidgets.
-
-    Args:
-        description: what is being done.
-        total: units of work in all.
-        display: IPython's, which is imported where a notebook runs.
-    """
+    """A bar below a notebook's cell, by IPython alone: rich's and tqdm's need ipywidgets."""
 
     def __init__(self, description: str, total: int, display: Any) -> None:
         self._description, self._total, self._display = description, total, display
@@ -145,7 +124,7 @@ class Task:
         self.total = total
         self.done = 0
         self._console = console or Console(stderr=True)
-        self._bar: _Bar | None = None
+        self._bar: _TerminalBar | _NotebookBar | None = None
         self._lock = threading.Lock()
         self._began = self._told = time.monotonic()
 
@@ -160,28 +139,16 @@ class Task:
     def advance(self, units: int = 1) -> None:
         """Says that `units` more are done; threads may say so at once."""
         with self._lock:
-            self._advance(units)
+            self.done += units
+            now = time.monotonic()
+            if self._bar is not None:
+                self._bar.draw(self.done)
+            elif self.total and now - self._told >= _LINE_EVERY:
+                self._told = now
+                share = 100 * self.done / self.total
+                log.info("%s: %.0f %% after %.0f s", self.description, share, now - self._began)
 
-    def _advance(self, units: int) -> None:
-        self.done += units
-        now = time.monotonic()
-        if self._bar is not None:
-            self._bar.draw(self.done)
-        elif self.total and now - self._told >= _LINE_EVERY:
-            self._told = now
-            log.info(
-                "%s: %.0f %% after %.0f s",
-                self.description,
-                100 * self.done / self.total,
-                now - self._began,
-            )
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self._bar is not None:
             self._bar.close()
         if self.total and kind is None:

@@ -18,12 +18,14 @@ from __future__ import annotations
 import functools
 import importlib
 import importlib.metadata
+import importlib.util
 import inspect
 import itertools
 import logging
 import sys
+import traceback
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -33,17 +35,21 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from cfx.core.component import API_VERSION, Component, Settings, validate
-from cfx.core.errors import CfxError, ConfigError, PluginError, Terminated, nearest
-from cfx.core.extras import advice
+from cfx.core.errors import (
+    OWN,
+    CfxError,
+    ConfigError,
+    PluginError,
+    Terminated,
+    advice,
+    nearest,
+)
 from cfx.core.guest import same_environment
 
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")
 R = TypeVar("R")
-
-OWN = "cfx-driving"
-"""cfx's own distribution: no other can replace its components."""
 
 THIS_PROCESS = "this process"
 """Stands for the distribution of a component that a program has added."""
@@ -223,9 +229,7 @@ def entries(kind: str) -> tuple[Entry, ...]:
     """
     announced = _of_kind(kind_of(kind))
     added = [one for one in _of_this_process.values() if one.kind == kind_of(kind).name]
-    if not added:
-        return announced
-    return tuple(sorted([*announced, *added], key=attrgetter("name", "distribution")))
+    return _sorted([*announced, *added])
 
 
 def names(kind: str) -> tuple[str, ...]:
@@ -242,12 +246,8 @@ def entry(kind: str, name: str) -> Entry:
     """
     about = kind_of(kind)
     call, what = about.call(name), about.name
-    found = []
-    for candidate in entries(kind):
-        if candidate.name == name:
-            if candidate.distribution == OWN:
-                return candidate
-            found.append(candidate)
+    every = [one for one in entries(kind) if one.name == name]
+    found = [one for one in every if one.distribution == OWN] or every
     if not found:
         known = names(kind)
         if not known and about.name in KINDS:
@@ -389,7 +389,7 @@ def installed(kind: str) -> tuple[Installed[Any], ...]:
 @functools.lru_cache(maxsize=8)
 def _installed(
     kind: str,
-    search_path: tuple[tuple[str, ...], ...],  # noqa: ARG001 - part of the cache's key
+    search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - part of the cache's key
 ) -> tuple[Installed[Any], ...]:
     made = []
     for found in entries(kind):
@@ -426,13 +426,8 @@ def rivals(found: Entry) -> tuple[Entry, ...]:
     """
     if found.distribution == OWN:
         return ()
-    others = []
-    for other in entries(found.kind):
-        if other.name == found.name and other != found:
-            if other.distribution == OWN:
-                return (other,)
-            others.append(other)
-    return tuple(others)
+    others = [one for one in entries(found.kind) if one.name == found.name and one != found]
+    return tuple([one for one in others if one.distribution == OWN] or others)
 
 
 def other_api(found: Entry) -> str:
@@ -459,32 +454,30 @@ def other_api(found: Entry) -> str:
     )
 
 
+def _entry_of(cls: type) -> Entry | None:
+    """Returns what announced a class; None if no distribution did."""
+    return next((found for found, loaded in _loaded.items() if loaded is cls), None)
+
+
 def origin(component: Component | type[Component]) -> str:
     """Returns whose a component is, for messages: kind, name, class and distribution.
 
     A class that no distribution announces is named alone.
     """
     cls = component if isinstance(component, type) else type(component)
-    for found, loaded in _loaded.items():
-        if loaded is cls:
-            return str(found)
-    return f"{cls.kind} {cls.__name__}"
+    return str(_entry_of(cls) or f"{cls.kind} {cls.__name__}")
 
 
 def is_own(component: Component) -> bool:
     """Says whether a component is one of cfx's own."""
-    for found, loaded in _loaded.items():
-        if loaded is type(component):
-            return found.distribution == OWN
-    return False
+    found = _entry_of(type(component))
+    return found is not None and found.distribution == OWN
 
 
 def name_of(component: Component) -> str:
     """Returns the name under which configs choose a component; its class's if it is none's."""
-    for found, loaded in _loaded.items():
-        if loaded is type(component):
-            return found.name
-    return type(component).__name__
+    found = _entry_of(type(component))
+    return type(component).__name__ if found is None else found.name
 
 
 def in_words(error: BaseException) -> str:
@@ -532,32 +525,17 @@ def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel)
             log.warning("%s of %s is deprecated: %s", path, found, field.deprecation_message)
 
 
-def _search_path() -> tuple[tuple[str, ...], ...]:
+def _search_path() -> tuple[tuple[str, float], ...]:
     """Returns a stamp that changes when a distribution is installed.
 
     With it as a key of a cache, a new plugin is seen without a restart.
     """
-    found = []
-    for folder in sys.path:
-        if folder and Path(folder).exists():
-            found.append(_metadata_in(folder, Path(folder).stat().st_mtime))
-    return tuple(found)
+    folders = [Path(folder) for folder in sys.path if folder]
+    return tuple((str(one), one.stat().st_mtime) for one in folders if one.exists())
 
 
-@functools.lru_cache(maxsize=64)
-def _metadata_in(folder: str, changed: float) -> tuple[str, ...]:
-    """Returns a folder and the metadata of distributions that lie in it, with their times.
-
-    Other files come and go where a job is started: they announce nothing.
-    """
-    found = [folder]
-    try:
-        for path in sorted(Path(folder).iterdir()):
-            if path.suffix in {".dist-info", ".egg-info", ".egg-link", ".egg"}:
-                found.append(f"{path.name} {path.stat().st_mtime}")
-    except OSError:  # such as an archive, which says nothing of its parts
-        found.append(str(changed))
-    return tuple(found)
+def _sorted(found: Iterable[Entry]) -> tuple[Entry, ...]:
+    return tuple(sorted(found, key=attrgetter("name", "distribution")))
 
 
 def _of_kind(kind: Kind) -> tuple[Entry, ...]:
@@ -566,7 +544,7 @@ def _of_kind(kind: Kind) -> tuple[Entry, ...]:
 
 @functools.lru_cache(maxsize=1)
 def _announced(
-    search_path: tuple[tuple[str, ...], ...],  # noqa: ARG001 - the cache's key
+    search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - the cache's key
 ) -> dict[str, tuple[Entry, ...]]:
     """Returns the entries of every entry-point group of cfx, sorted."""
     found: dict[str, list[Entry]] = {}
@@ -581,49 +559,27 @@ def _announced(
             seen.add(announced[0][1].distribution)
             for group, one in announced:
                 found.setdefault(group, []).append(one)
-    ordered = {}
-    for group, ones in found.items():
-        ordered[group] = tuple(sorted(ones, key=attrgetter("name", "distribution")))
-    return ordered
+    return {group: _sorted(ones) for group, ones in found.items()}
 
 
 def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[str, Entry]]:
-    """Yields what one distribution announces, each with its entry-point group.
-
-    Raises:
-        ValueError: its metadata are damaged.
-    """
+    """Yields what one distribution announces, each with its entry-point group."""
     kinds = {kind.entry_points: kind.name for kind in (*KINDS.values(), *PARTS.values())}
-    points = list(distribution.entry_points)
+    points = [point for point in distribution.entry_points if point.group.startswith("cfx.")]
     api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
-    ours = []
-    for point in points:
-        if point.group.startswith("cfx.") and point.group != API_GROUP:
-            ours.append(point)
+    ours = [point for point in points if point.group != API_GROUP]
     if not ours:
         return
     metadata = distribution.metadata  # read anew each time that it is asked for
     name, version = metadata["Name"], metadata["Version"]
     if not isinstance(name, str) or not isinstance(version, str):
         raise ValueError("the metadata name no distribution, or no version")
-    summary = ""
-    if "Summary" in metadata:
-        summary = metadata["Summary"]
+    summary = metadata["Summary"] if "Summary" in metadata else ""  # noqa: SIM401 - typed so
     location = str(distribution.locate_file(""))
     for point in ours:
-        yield (
-            point.group,
-            Entry(
-                kind=kinds.get(point.group, point.group.removeprefix("cfx.").removesuffix("s")),
-                name=point.name,
-                target=point.value,
-                distribution=name,
-                version=version,
-                location=location,
-                summary=summary,
-                api=api,
-            ),
-        )
+        kind = kinds.get(point.group, point.group.removeprefix("cfx.").removesuffix("s"))
+        one = Entry(kind, point.name, point.value, name, version, location, summary, api)
+        yield point.group, one
 
 
 def _import(found: Entry) -> Any:
@@ -684,26 +640,77 @@ def _resolve(target: str) -> Any:
 
 
 def _without_blanks(schema: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
-    """Leaves out null for settings that are required and cannot be null.
-
-    The error then asks for a value.
-    """
+    """Leaves out null where a value is required, so that the error asks for one."""
     kept: dict[str, Any] = {}
     for key, value in values.items():
-        kept[key] = value
         field = schema.model_fields.get(key)
-        if field is None:
-            continue
-        nested: Any = field.annotation
-        if value is None and is_blank(field):
-            del kept[key]
-        elif (
-            isinstance(value, Mapping) and inspect.isclass(nested) and issubclass(nested, BaseModel)
-        ):
+        nested: Any = None if field is None else field.annotation
+        if isinstance(value, Mapping) and inspect.isclass(nested) and issubclass(nested, BaseModel):
             kept[key] = _without_blanks(nested, value)
+        elif value is not None or field is None or not is_blank(field):
+            kept[key] = value
     return kept
 
 
 def is_blank(field: FieldInfo) -> bool:
     """Says whether null in a config node means that the user must give a value."""
     return field.is_required() and type(None) not in get_args(field.annotation)
+
+
+# --- errors of plugins' code ----------------------------------------------------------------------
+
+_PACKAGE = Path(__file__).resolve().parent.parent
+
+
+def blame(
+    error: BaseException, more: str = "the whole traceback is in the log"
+) -> PluginError | None:
+    """Returns a sentence if an error comes from a plugin's code; None if it is cfx's own.
+
+    The innermost frame that is cfx's or a plugin's decides: what a library answers to a plugin's
+    call is the plugin's.
+
+    Args:
+        more: where the traceback is.
+    """
+    failure = in_words(error)
+    if isinstance(error, SystemExit):
+        failure = f"it called sys.exit({error.code!r})"
+    elif isinstance(error, MemoryError):
+        failure = "memory ran out"
+    packages = _packages()
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        file = Path(frame.filename).resolve()
+        if file.is_relative_to(_PACKAGE):
+            return None
+        for package, found in packages.items():
+            if file.is_relative_to(package):
+                where = f"{file.relative_to(package.parent)}, line {frame.lineno}"
+                return PluginError(
+                    f"{found} failed in {where}: {failure}; {more};"
+                    f" repair that distribution, or pip uninstall {found.distribution}"
+                )
+    return None
+
+
+def _packages() -> dict[Path, Entry]:
+    """Returns the places of plugins' code: a package's folder, or a single module's file."""
+    found: dict[Path, Entry] = {}
+    for kind in (*KINDS, *PARTS):
+        for one in entries(kind):
+            if one.distribution not in {OWN, THIS_PROCESS}:
+                for place in _places(one.package):
+                    found.setdefault(place, one)
+    return found
+
+
+def _places(module: str) -> list[Path]:
+    """Returns where a module's code is; nothing if it cannot be found."""
+    try:
+        spec = importlib.util.find_spec(module)
+    except (ImportError, ValueError):
+        spec = None
+    if spec is None:
+        return []
+    places = [*(spec.submodule_search_locations or ()), spec.origin]
+    return [Path(place).resolve() for place in places[:1] if place is not None]

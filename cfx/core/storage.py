@@ -16,8 +16,14 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from cfx.core.errors import CfxError, DataError, NotInstalledError, without_passwords
-from cfx.core.extras import install_line
+from cfx.core.errors import (
+    CfxError,
+    DataError,
+    NotInstalledError,
+    first_line,
+    install_line,
+    without_passwords,
+)
 from cfx.core.files import atomic_write
 
 _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}
@@ -153,12 +159,7 @@ class RemoteFolder:
 
 
 def _opened(url: str) -> tuple[Any, str]:
-    """Returns a file system and the path in it.
-
-    Raises:
-        NotInstalledError: its package is not installed.
-        CfxError: no file system has such URLs.
-    """
+    """Returns a file system and the path in it."""
     import fsspec
 
     scheme = url.partition("://")[0].lower()
@@ -183,12 +184,7 @@ def _copy(system: Any, path: str) -> Path:
 
 
 def _copy_files(system: Any, path: str, names: list[str], copy: Path) -> None:
-    """Copies files below a path to a folder, which appears whole.
-
-    Raises:
-        DataError: a name leads out of the folder.
-        OSError: the folder cannot be written.
-    """
+    """Copies files below a path to a folder, which appears whole."""
     copy.parent.mkdir(parents=True, exist_ok=True)
     partial = copy.with_name(f".{secrets.token_hex(8)}")
     try:
@@ -229,8 +225,7 @@ def _os_errors() -> Iterator[None]:
     except OSError:
         raise
     except Exception as error:  # each store raises errors of its own
-        first = next(iter(str(error).splitlines()), "")
-        raise OSError(f"{type(error).__name__}: {first}") from error
+        raise OSError(f"{type(error).__name__}: {first_line(error)}") from error
 
 
 @contextmanager
@@ -243,7 +238,5 @@ def _explained(what: str) -> Iterator[None]:
     except FileNotFoundError:
         raise DataError(f"{without_passwords(what)}: no such file") from None
     except Exception as error:  # each store raises errors of its own
-        first = next(iter(str(error).splitlines()), type(error).__name__)
-        raise DataError(
-            f"{without_passwords(what)}: cannot be read ({type(error).__name__}: {first})"
-        ) from error
+        reason = f"{type(error).__name__}: {first_line(error)}"
+        raise DataError(f"{without_passwords(what)}: cannot be read ({reason})") from error

@@ -13,17 +13,15 @@ import numpy as np
 from pydantic import BeforeValidator, Field
 from pydantic_core import PydanticCustomError
 
-from cfx.core import registry, scratch
+from cfx.core import memory, registry
 from cfx.core.component import Component, Distinct, Settings
 from cfx.core.errors import DataError, PluginError, listed, nearest
 from cfx.core.files import absolute
-from cfx.core.memory import give_back
 from cfx.core.storage import is_url, local_copies
-from cfx.data.accelerations import Accelerations, with_usable_accelerations
 from cfx.data.files import FileStart, recording_of, stem
 from cfx.data.kinematics import Check, check_kinematics
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
-from cfx.data.resample import resampled
+from cfx.data.signals import Accelerations, resampled, scaled, with_usable_accelerations
 from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
 from cfx.data.tracks import summed
 
@@ -240,19 +238,16 @@ class Dataset(Component):
             PluginError: `read` gives anything but pairs of finite numbers.
         """
         pairs = self.read()
-        give_back()
+        memory.give_back()
         self._check(pairs)
         if not len(pairs):
-            raise DataError(f"{pairs.source}: no leader-follower pair found{_why(pairs.dropped)}")
+            reasons = [f"{one.count:,} {one.unit}: {one.reason}" for one in pairs.dropped]
+            why = f" (left out: {'; '.join(reasons)})" if reasons else ""
+            raise DataError(f"{pairs.source}: no leader-follower pair found{why}")
         pairs = with_sites(pairs, self.settings.site)
         pairs = with_vehicles(pairs, self.settings.vehicle)
-        pairs = _select_label(pairs, "recording", self.settings.recording)
-        if self.settings.lanes is not None:
-            pairs = _select_lanes(pairs, self.settings.lanes)
-        if self.settings.pair_ids is not None:
-            pairs = _select_ids(pairs, self.settings.pair_ids)
-        for name in ("driver_type", "leader_driver_type"):
-            pairs = _select_label(pairs, name, getattr(self.settings, name))
+        for name in _NOUNS:
+            pairs = _selected(pairs, name, getattr(self.settings, name))
         recorded = {pair.pair_id: pair for pair in pairs}
         if self.settings.time_step is not None:
             pairs = resampled(pairs, self.settings.time_step)
@@ -287,24 +282,6 @@ class Dataset(Component):
                         f"{registry.origin(self)}: pair {pair.pair_id} has a {name} that is not"
                         " finite; a dataset splits or leaves out what has gaps"
                     )
-
-
-def scaled(pairs: PairSet, factor: float) -> PairSet:
-    """Returns pairs with all distances, speeds and accelerations multiplied by a factor.
-
-    Time and vehicles' lengths stay as they are, so every gap is multiplied too.
-    """
-    if factor == 1.0:
-        return pairs
-
-    def scale(pair: Pair) -> Pair:
-        signals = {name: getattr(pair, name) * factor for name in SIGNALS}
-        # The leader's rear bumper is scaled, then its length added again.
-        signals["leader_position"] = signals["leader_position"] + pair.leader_length * (1 - factor)
-        return replace(pair, **signals)
-
-    source = f"{pairs.source}, {factor:g} times as fast"
-    return replace(pairs.changed(scale), source=source)
 
 
 def joined(files: Iterable[PairSet]) -> PairSet:
@@ -354,11 +331,11 @@ def _compact(files: Iterable[PairSet]) -> list[PairSet]:
     for part in files:
         parts.append(part)
         size += part.size
-        if size >= scratch.LARGE:
+        if size >= memory.LARGE:
             for number in range(moved, len(parts)):
                 parts[number] = parts[number].in_file()
             moved = len(parts)
-            give_back()
+            memory.give_back()
     return parts
 
 
@@ -370,80 +347,52 @@ def _require_different(parts: Sequence[PairSet]) -> None:
         for pair in part:
             for key in (pair.pair_id, pair.content):
                 if key in seen:
-                    raise DataError(_twice(*seen[key], part, pair))
+                    source, name = seen[key]
+                    there = "" if name == pair.pair_id else f", there '{pair.pair_id}',"
+                    raise DataError(
+                        f"{source} and {part.source}: pair '{name}'{there} stands in both files;"
+                        " leave it out of one of them"
+                    )
                 here[key] = (part.source, pair.pair_id)
         seen |= here
 
 
-def _twice(source: str, name: str, part: PairSet, pair: Pair) -> str:
-    """Returns that a pair called `name` in one file stands in another one too."""
-    which = f"pair '{name}'"
-    if name != pair.pair_id:
-        which += f", there '{pair.pair_id}',"
-    return f"{source} and {part.source}: {which} stands in both files; leave it out of one of them"
+_NOUNS = {
+    "recording": "recording",
+    "lanes": "lane",
+    "pair_ids": "pair",
+    "driver_type": "type",
+    "leader_driver_type": "type",
+}
+"""What the settings that select pairs by a value name."""
 
 
-def _why(dropped: Sequence[Dropped]) -> str:
-    """Returns what was left out, in brackets; "" if nothing was."""
-    if not dropped:
-        return ""
-    reasons = [f"{drop.count:,} {drop.unit}: {drop.reason}" for drop in dropped]
-    return f" (left out: {'; '.join(reasons)})"
-
-
-def _select_lanes(pairs: PairSet, lanes: Sequence[int]) -> PairSet:
-    known = sorted({pair.lane for pair in pairs if pair.lane is not None})
-    if not known:
-        raise DataError(
-            f"data.lanes={list(lanes)}: {pairs.source} does not say in which lane its pairs are;"
-            " leave data.lanes out"
-        )
-    if not lanes or not set(lanes) <= set(known):
-        raise DataError(
-            f"data.lanes={list(lanes)}: {pairs.source} has pairs in lanes {listed(known)} only;"
-            " choose among these"
-        )
-    kept = [pair.lane in lanes for pair in pairs]
-    return pairs.select(kept, f"in other lanes than {listed(sorted(set(lanes)))}")
-
-
-def _select_ids(pairs: PairSet, wanted: Sequence[str]) -> PairSet:
-    known = [pair.pair_id for pair in pairs]
-    what = ""
-    if not wanted:
-        what = "the list is empty."
-    for name in wanted:
-        if name not in known:
-            what = f"there is no pair '{name}'.{nearest(name, known)}"
-            break
-    if what:
-        raise DataError(
-            f"data.pair_ids={list(wanted)}: {pairs.source}: {what} Known: {listed(known)}."
-        )
-    return pairs.select([name in wanted for name in known], "other pairs than data.pair_ids")
-
-
-def _select_label(pairs: PairSet, name: str, wanted: str | None) -> PairSet:
-    """Keeps the pairs with a label; all where None is wanted.
-
-    Args:
-        name: recording, driver_type or leader_driver_type.
-    """
+def _selected(pairs: PairSet, name: str, wanted: Any) -> PairSet:
+    """Keeps the pairs that a setting names; all where it is None."""
     if wanted is None:
         return pairs
-    labels = [getattr(pair, name) for pair in pairs]
-    known = [label for label in dict.fromkeys(labels) if label]
+    attribute = {"lanes": "lane", "pair_ids": "pair_id"}.get(name, name)
+    values = [getattr(pair, attribute) for pair in pairs]
+    known = [value for value in dict.fromkeys(values) if value not in {None, ""}]
     if not known:
+        unsaid = "in which lane its pairs are" if name == "lanes" else "what drives its vehicles"
         raise DataError(
-            f"data.{name}={wanted}: {pairs.source} does not say what drives its vehicles; leave"
-            f" data.{name} out"
+            f"data.{name}={wanted}: {pairs.source} does not say {unsaid}; leave data.{name} out"
         )
-    if wanted not in known:
-        raise DataError(
-            f"data.{name}={wanted}: {pairs.source} has no such {name.rpartition('_')[2]}."
-            f"{nearest(wanted, known)} Known: {listed(known)}."
-        )
-    return pairs.select([one == wanted for one in labels], f"another {name} than '{wanted}'")
+    several = isinstance(wanted, list)
+    asked = wanted if several else [wanted]
+    what = "" if asked else "the list is empty."
+    for one in asked:
+        if one not in known:
+            near = nearest(str(one), [str(value) for value in known])
+            what = f"there is no {_NOUNS[name]} '{one}'.{near}"
+            break
+    if what:
+        raise DataError(f"data.{name}={wanted}: {pairs.source}: {what} Known: {listed(known)}.")
+    others = f"other {name} than {listed(asked)}" if several else f"another {name} than '{wanted}'"
+    if name == "pair_ids":
+        others = "other pairs than data.pair_ids"
+    return pairs.select([value in asked for value in values], others)
 
 
 def _select_long(pairs: PairSet, min_frames: int) -> PairSet:

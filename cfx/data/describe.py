@@ -15,7 +15,7 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 from cfx.core import registry
-from cfx.core.errors import DataError, PluginError, listed
+from cfx.core.errors import OWN, DataError, PluginError, listed
 from cfx.core.files import path_override
 from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset
@@ -23,9 +23,16 @@ from cfx.data.files import Floats, beginning, partitions
 from cfx.data.kinematics import in_words
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.plausible import doubts, rare
-from cfx.data.resample import frames_in_steps
-from cfx.data.site_styles import ALL, NOT_KNOWN, styles_by_site
-from cfx.data.style import INDICATORS, STANDING_MPS, StyleResult, name_of_indicator
+from cfx.data.signals import frames_in_steps
+from cfx.data.style import (
+    ALL,
+    INDICATORS,
+    NOT_KNOWN,
+    STANDING_MPS,
+    StyleResult,
+    name_of_indicator,
+    styles_by_site,
+)
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,12 +76,7 @@ class Description(NamedTuple):
     pairs: PairSet | None
 
 
-def describe(path: Path, settings: Mapping[str, Any] | None = None, options: str = "") -> str:
-    """Says what a recording holds; arguments and errors are those of `described`."""
-    return described(path, settings, options).text
-
-
-def described(
+def describe(
     path: Path, settings: Mapping[str, Any] | None = None, options: str = ""
 ) -> Description:
     """Reads a recording and says what it holds.
@@ -102,10 +104,15 @@ def described(
     pieces: list[RenderableType] = [str(path), "", _overview(dataset.layout, contents)]
     if len(contents.pairs):
         pieces += ["", _motion(contents.pairs)]
-    pieces += ["", *_left_out(contents.pairs)]
+    left_out = _counts(contents.pairs.dropped)
+    pieces += ["", f"Left out in reading:{'' if left_out else ' nothing'}", *left_out]
     if contents.pairs.ends:
         pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
-    pieces += ["", *_problems(contents, dataset)]
+    problems = [*_suspicions(contents, dataset.units())]
+    if contents.problem:
+        problems.append(contents.problem)
+    pieces += ["", f"Problems:{'' if problems else ' none found'}"]
+    pieces += [f"  {sentence}" for sentence in problems]
     more, kept = _advice(_lengths(contents.pairs), dataset.settings.min_frames)
     pieces += ["", reader.use(path) + more, *kept]
     return Description(_text(pieces), contents.pairs)
@@ -113,11 +120,10 @@ def described(
 
 def describe_sites(pairs: PairSet) -> str:
     """Compares the sites of pairs: a row for each, and for its types of drivers."""
-    table = Table(title="By site: medians over frames (5 % to 95 %)", title_justify="left")
-    table.box = None
-    table.add_column("site")
-    for heading in ("pairs", "drivers", "minutes", "speed, m/s", "time headway, s", "gap, m"):
-        table.add_column(heading, justify="right")
+    headings = ("pairs", "drivers", "minutes", "speed, m/s", "time headway, s", "gap, m")
+    table = _table(
+        "site", *headings, title="By site: medians over frames (5 % to 95 %)", right=1, left=1
+    )
     of_site: dict[str, list[Pair]] = {}
     for pair in pairs:
         of_site.setdefault(pair.site or pair.recording, []).append(pair)
@@ -157,18 +163,14 @@ def describe_style(style: StyleResult, distances: pd.DataFrame | None) -> str:
     sites = styles_by_site(style)
     if sites is None:
         return "Driving style: there is one site alone; give the files of several"
-    table = Table(
-        title="Driving style, 0 conservative to 1 aggressive: medians over drivers",
-        title_justify="left",
-        box=None,
-        padding=(0, 1, 0, 0),
-    )
-    table.add_column("site", no_wrap=True)
-    for heading in ("drivers", "score", "95 %"):
-        table.add_column(heading, justify="right", no_wrap=True)
+    headings = ["site", "drivers", "score", "95 %"]
     for one in INDICATORS:
         words = name_of_indicator(one.name).replace(" ", "\n")
-        table.add_column(f"{words}\n{one.unit}", justify="right", no_wrap=True)
+        headings.append(f"{words}\n{one.unit}")
+    title = "Driving style, 0 conservative to 1 aggressive: medians over drivers"
+    table = _table(*headings, title=title, right=1, left=0)
+    for column in table.columns:
+        column.no_wrap = True
     weights = [f"{style.weights[one.name]:.2f}" for one in INDICATORS]
     table.add_row("entropy weight", "", "", "", *weights)
     for row in sites.to_dict("records"):
@@ -182,23 +184,30 @@ def describe_style(style: StyleResult, distances: pd.DataFrame | None) -> str:
         table.add_row(str(name), str(row["drivers"]), score, interval, *values)
     pieces: list[RenderableType] = [table]
     if distances is not None:
-        apart = Table(title="How far apart: energy distance of the scores", title_justify="left")
-        apart.box = None
-        for heading in ("", "", "distance", "p", "differ most in"):
-            apart.add_column(heading, justify="right" if heading in ("distance", "p") else "left")
+        title = "How far apart: energy distance of the scores"
+        apart = _table("", "", "distance", "p", "differ most in", title=title, right=1, left=1)
+        apart.columns[1].justify = apart.columns[4].justify = "left"
         for row in distances.to_dict("records"):
-            ends = [
-                _of_group(row["site"], row["driver_type"]),
-                _of_group(row["other_site"], row["other_driver_type"]),
-            ]
+            ends = []
+            for whose in ("", "other_"):
+                site, kind = row[f"{whose}site"], row[f"{whose}driver_type"]
+                ends.append(str(site) if kind == ALL else f"{site}, {kind}")
             most = name_of_indicator(str(row["most"]))
             apart.add_row(*ends, f"{row['distance']:.3f}", f"{row['p_value']:.3f}", most)
         pieces += ["", apart]
     return _text(pieces, _WIDE)
 
 
-def _of_group(site: object, kind: object) -> str:
-    return str(site) if kind == ALL else f"{site}, {kind}"
+def _table(*headings: str, title: str | None = None, right: int = 2, left: int = 2) -> Table:
+    """Returns a table without rows and lines, whose first column holds names, the others numbers.
+
+    Args:
+        right, left: blanks beside a column.
+    """
+    table = Table(title=title, title_justify="left", box=None, padding=(0, right, 0, left))
+    for number, heading in enumerate(headings):
+        table.add_column(heading, justify="right" if number else "left")
+    return table
 
 
 class _Reader(NamedTuple):
@@ -213,8 +222,7 @@ class _Reader(NamedTuple):
 
     def of(self, path: Path) -> Dataset:
         """Returns the dataset of a file."""
-        created = registry.create("dataset", {**self.settings, "path": str(path)})
-        return cast(Dataset, created)
+        return cast(Dataset, registry.create("dataset", {**self.settings, "path": str(path)}))
 
     def use(self, path: Path) -> str:
         """Returns the line that names the file in a job."""
@@ -224,13 +232,11 @@ class _Reader(NamedTuple):
 
 def _describe_partitions(folder: Path, reader: _Reader) -> str:
     """Says what each file of a folder holds; reads one file after the other."""
-    table = Table(box=None, padding=(0, 2), header_style="")
-    table.add_column("file")
-    for heading in ("recordings", "rows", "pairs", "drivers", "frames", "of at least 700 frames"):
-        table.add_column(heading, justify="right")
+    headings = ("recordings", "rows", "pairs", "drivers", "frames", "of at least 700 frames")
+    table = _table("file", *headings)
     totals = [0] * 5
     names: set[str] = set()
-    lengths: list[_Length] = []
+    lengths: list[tuple[int, float]] = []
     files = partitions(folder)
     for file in files:
         dataset = reader.of(file)
@@ -247,20 +253,11 @@ def _describe_partitions(folder: Path, reader: _Reader) -> str:
         table.add_row(str(file.relative_to(folder)), listed(sorted(recordings), 2), *cells)
     table.add_row("all", f"{len(names):,}", *[f"{count:,}" for count in totals])
     more, kept = _advice(lengths, dataset.settings.min_frames)
-    return _text(
-        [
-            str(folder),
-            "",
-            f"{dataset.layout}, {len(files)} files, read one after the other",
-            "",
-            table,
-            "",
-            "A recording alone: python -m cfx data describe FILE",
-            reader.use(folder) + more,
-            *kept,
-            "One recording of it: data.recording=NAME",
-        ]
-    )
+    layout = f"{dataset.layout}, {len(files)} files, read one after the other"
+    alone = "A recording alone: python -m cfx data describe FILE"
+    one = "One recording of it: data.recording=NAME"
+    use = reader.use(folder) + more
+    return _text([str(folder), "", layout, "", table, "", alone, use, *kept, one])
 
 
 def _text(pieces: Sequence[RenderableType], width: int = _WIDTH) -> str:
@@ -280,7 +277,7 @@ def dataset_of(path: Path) -> str:
     """
     start = beginning(path)
     layouts = []
-    found = sorted(registry.entries("dataset"), key=lambda one: one.distribution != registry.OWN)
+    found = sorted(registry.entries("dataset"), key=lambda one: one.distribution != OWN)
     for one in found:
         cls = _usable(one)
         if cls is None:
@@ -315,36 +312,26 @@ def _frames(pairs: PairSet) -> int:
     return sum(len(pair) for pair in pairs)
 
 
-class _Length(NamedTuple):
-    """Length of a pair."""
-
-    frames: int
-    dt: float
-
-    def in_steps(self, step: float) -> int:
-        """Returns its frames after `data.time_step=STEP`."""
-        return frames_in_steps(self.frames, self.dt, step)
+def _lengths(pairs: PairSet) -> list[tuple[int, float]]:
+    """Returns the frames of each pair, and its time step, s."""
+    return [(len(pair), round(pair.dt, 9)) for pair in pairs]
 
 
-def _lengths(pairs: PairSet) -> list[_Length]:
-    return [_Length(len(pair), round(pair.dt, 9)) for pair in pairs]
-
-
-def _advice(pairs: Sequence[_Length], usual: int) -> tuple[str, list[str]]:
+def _advice(pairs: Sequence[tuple[int, float]], usual: int) -> tuple[str, list[str]]:
     """Returns the options that a job needs to use at least half of the pairs, and what it keeps.
 
     Args:
-        pairs: of all files.
+        pairs: frames and time steps, of all files.
         usual: shortest pair, in frames, that a job keeps unless told otherwise.
     """
     if not pairs:
         return "", []
     options = ""
-    steps = {pair.dt for pair in pairs}
+    steps = {dt for _, dt in pairs}
     step = max(steps)
     if len(steps) > 1:
         options = f" data.time_step={step:g}"
-    lengths = sorted(pair.in_steps(step) for pair in pairs)
+    lengths = sorted(frames_in_steps(frames, dt, step) for frames, dt in pairs)
     median = lengths[(len(lengths) - 1) // 2]
     least = usual
     if sum(length >= usual for length in lengths) * 2 < len(lengths):
@@ -362,9 +349,7 @@ def _advice(pairs: Sequence[_Length], usual: int) -> tuple[str, list[str]]:
 def _overview(layout: str, contents: Contents) -> Table:
     """Returns what a file holds, a row per question."""
     pairs = contents.pairs
-    recordings: dict[str, int] = {}
-    for pair in pairs:
-        recordings[pair.recording] = recordings.get(pair.recording, 0) + 1
+    recordings = Counter(pair.recording for pair in pairs)
     counted = [f"{name} ({count} pairs)" for name, count in recordings.items()]
     drivers = {pair.driver for pair in pairs}
     lanes = sorted({pair.lane for pair in pairs if pair.lane is not None})
@@ -375,10 +360,8 @@ def _overview(layout: str, contents: Contents) -> Table:
     table.add_row("layout", layout)
     table.add_row("rows", f"{contents.rows:,}")
     table.add_row("vehicles", f"{contents.vehicles:,}")
-    if counted:
-        table.add_row("recordings", f"{len(recordings)}: {listed(counted, 6)}")
-    else:
-        table.add_row("recordings", "none with pairs")
+    found = f"{len(recordings)}: {listed(counted, 6)}" if counted else "none with pairs"
+    table.add_row("recordings", found)
     table.add_row("lanes", listed(lanes) or "not known")
     table.add_row("pairs", f"{len(pairs):,} of {len(drivers):,} drivers, {_frames(pairs):,} frames")
     table.add_row("time step", listed([f"{step:g} s" for step in steps]) or "-")
@@ -396,10 +379,7 @@ def _overview(layout: str, contents: Contents) -> Table:
 
 def _motion(pairs: PairSet) -> Table:
     """Returns how the vehicles move: quantiles over all frames."""
-    table = Table(box=None, padding=(0, 2), header_style="")
-    table.add_column("over all pairs")
-    for heading in _QUANTILES.values():
-        table.add_column(heading, justify="right")
+    table = _table("over all pairs", *_QUANTILES.values())
     for name, values in _quantities(pairs):
         if not len(values):
             continue
@@ -429,24 +409,8 @@ def _joined(pairs: PairSet, name: str) -> Floats:
     return np.concatenate([getattr(pair, name) for pair in pairs])
 
 
-def _left_out(pairs: PairSet) -> list[str]:
-    if not pairs.dropped:
-        return ["Left out in reading: nothing"]
-    return ["Left out in reading:", *_counts(pairs.dropped)]
-
-
 def _counts(counts: Sequence[Dropped]) -> list[str]:
     return [f"  {one.count:,} {one.unit}: {one.reason}" for one in counts]
-
-
-def _problems(contents: Contents, dataset: Dataset) -> list[str]:
-    """Returns what a recording may hold but rarely should."""
-    found = list(_suspicions(contents, dataset.units()))
-    if contents.problem:
-        found.append(contents.problem)
-    if not found:
-        return ["Problems: none found"]
-    return ["Problems:", *(f"  {sentence}" for sentence in found)]
 
 
 def _suspicions(contents: Contents, units: Mapping[str, str]) -> Iterator[str]:

@@ -36,9 +36,6 @@ PARQUET = b"PAR1"
 _HEAD = 1 << 16
 """Bytes that are looked at before a file is read."""
 
-_BLOCK = 1 << 22
-"""Bytes that are read at once."""
-
 _COLUMN = "recording="
 
 
@@ -58,7 +55,10 @@ class FileStart(NamedTuple):
     def columns(self) -> tuple[str, ...]:
         """The names of a parquet file's columns; of a text, the cells of the first line."""
         if self.magic == PARQUET:
-            return _parquet_columns(self.path)
+            try:
+                return tuple(pq.read_schema(self.path).names)
+            except (pa.ArrowException, OSError, UnicodeDecodeError):  # it is damaged
+                return ()
         if not self.lines:
             return ()
         return tuple(cell.strip().strip('"') for cell in re.split("[,;]", self.lines[0]))
@@ -87,14 +87,6 @@ def beginning(path: Path) -> FileStart:
     if "\0" in text:
         text = ""
     return FileStart(path, start, tuple(text.splitlines()[:20]))
-
-
-def _parquet_columns(path: Path) -> tuple[str, ...]:
-    """Returns the names of a parquet file's columns; () if it is damaged."""
-    try:
-        return tuple(pq.read_schema(path).names)
-    except (pa.ArrowException, OSError, UnicodeDecodeError):
-        return ()
 
 
 def stem(path: Path) -> str:
@@ -143,28 +135,13 @@ def read_head(path: Path) -> bytes:
     Raises:
         DataError: the file cannot be read, or its gzip is damaged.
     """
-    with open_text(path) as file, _unpacking(path):
+    with open_text(path) as file, unpacking(path):
         return file.read(_HEAD)
 
 
-def unpacked_blocks(path: Path) -> Iterator[bytes]:
-    """Yields a text file, unpacked, in blocks of 4 MB.
-
-    Raises:
-        DataError: as `read_head`.
-    """
-    with open_text(path) as file:
-        while True:
-            with _unpacking(path):
-                block = file.read(_BLOCK)
-            if not block:
-                return
-            yield block
-
-
 @contextmanager
-def _unpacking(path: Path) -> Iterator[None]:
-    """Turns what a damaged gzip file raises into one sentence."""
+def unpacking(path: Path) -> Iterator[None]:
+    """Turns what a damaged gzip file raises into a DataError."""
     try:
         yield
     except EOFError:

@@ -238,29 +238,66 @@ class Contradiction:
         """
         if self.slope is None or self.words:
             return f"{self.signals}: {self.words}"
-        own = _units_of(self.signals.partition("_")[0], units or {})
+        return f"{self.signals}: {self._why(self.slope, units or {})}"
+
+    def _why(self, slope: float, units: Units) -> str:
+        """Returns what a slope says, and of which unit, sign or time step it is."""
+        step = f"the time step looks like {slope * self.dt:.3g} s, not {self.dt:.3g} s"
+        other = self.other_slope
+        own = _units_of(self.signals.partition("_")[0], units)
+        room = _SAME
         if self.quantity == "gap":
-            return f"{self.signals}: {_why_gap(self.slope, units or {})}"
-        if self.quantity == "speed":
-            why = _why_speed(self.slope, self.other_slope, self.dt, own)
-            return f"{self.signals}: {why}"
-        why = _why_position(self.slope, self.other_slope, self.dt, own)
-        return (
-            f"{self.signals}: the distance driven is {self.slope:.3g} times speed times time: {why}"
-        )
+            said = f"the gap changes {slope:.3g} times as the relative speed says"
+            known = {-1.0: "the leader's and the follower's columns look swapped"}
+            known |= _factors(own, slower=("gap",), faster=("speed",))
+            otherwise = (
+                f"gaps must be in {own['gap']}, speeds in {own['speed']}, times in {own['time']}"
+            )
+            room = _SAME_GAP
+        elif self.quantity == "speed":
+            said = f"speeds change {slope:.3g} times as much as the accelerations say"
+            if other is not None and abs(other - 1) > _TYPICAL and abs(slope / other - 1) < _SAME:
+                return f"{said}, and positions as much more than the speeds say, so {step}"
+            known = _ACCELERATION_FACTORS | _factors(
+                own, faster=("acceleration",), slower=("speed",)
+            )
+            otherwise = f"they are {1 / slope:.2g} times what the speeds say; write m/s2"
+        else:
+            said = f"the distance driven is {slope:.3g} times speed times time"
+            if slope < 0:
+                return f"{said}: positions must grow along the lane"
+            if other is not None and abs(other / slope - 1) < _SAME:
+                said += ": speeds change as much faster than the accelerations say"
+                return f"{said}, so {step}"
+            known = _factors(own, faster=("speed", "time"), slower=("position",))
+            otherwise = (
+                f"positions must be in {own['position']}, speeds in {own['speed']}, times in"
+                f" {own['time']}, and all of this vehicle"
+            )
+        nearest = min(known, key=lambda one: abs(slope / one - 1))
+        is_near = abs(slope / nearest - 1) < room
+        return f"{said}: {known[nearest] if is_near else otherwise}"
 
 
 class _Relation(NamedTuple):
-    """A signal and its rate, `(T,)` each."""
+    """A signal of a pair and its rate, `(T,)` each."""
 
+    pair: Pair
     signals: str
     quantity: str
     values: Floats
     rates: Floats
 
-    def measured(self, dt: float) -> Agreement:
-        """Returns how changes over windows agree."""
-        return agreement(self.values, self.rates, dt)
+    def measured(self, *, whole: bool = False) -> Agreement:
+        """Returns how changes over windows agree, or over the whole pair."""
+        return agreement(self.values, self.rates, self.pair.dt, whole=whole)
+
+    def broken(
+        self, slope: float | None, words: str = "", also: Agreement | None = None
+    ) -> Contradiction:
+        """Returns that the two contradict each other; `also` is of the vehicle's other signal."""
+        other_slope = also.slope if also is not None and also.unexplained < 0.2 else None
+        return Contradiction(self.signals, self.quantity, slope, words, self.pair.dt, other_slope)
 
 
 def _relations(pair: Pair, who: str) -> tuple[_Relation, _Relation]:
@@ -268,13 +305,14 @@ def _relations(pair: Pair, who: str) -> tuple[_Relation, _Relation]:
     names = f"{who}_position", f"{who}_speed", f"{who}_acceleration"
     position, speed, acceleration = (getattr(pair, name) for name in names)
     return (
-        _Relation(f"{names[0]} and {names[1]}", "position", position, speed),
-        _Relation(f"{names[1]} and {names[2]}", "speed", speed, acceleration),
+        _Relation(pair, f"{names[0]} and {names[1]}", "position", position, speed),
+        _Relation(pair, f"{names[1]} and {names[2]}", "speed", speed, acceleration),
     )
 
 
 def _gap_relation(pair: Pair) -> _Relation:
-    return _Relation("gap and speeds", "gap", pair.gap, pair.leader_speed - pair.follower_speed)
+    closing = pair.leader_speed - pair.follower_speed
+    return _Relation(pair, "gap and speeds", "gap", pair.gap, closing)
 
 
 def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | None:
@@ -284,71 +322,52 @@ def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | Non
         units: those that its file is said to have; its signals are in SI units.
     """
     for who, other in (("leader", "follower"), ("follower", "leader")):
-        of_position, of_speed = _relations(pair, who)
-        speed = of_speed.measured(pair.dt)
-        exact = speed.slope if speed.unexplained < 0.2 else None
-        found = _single_frames(of_position, pair) or _wrong_distance(of_position, pair, exact)
-        if found is None:
-            position = of_position.measured(pair.dt)
-            found = _over_windows(of_position, position, _relations(pair, other)[0], pair, exact)
+        position, speed = _relations(pair, who)
+        of_position, of_speed = _relations(pair, other)
+        found = _broken(position, of_position, speed.measured())
         if found is not None:
             return _by_gap(found, pair, units or {})
-        found = _single_frames(of_speed, pair)
-        if found is None:
-            position = agreement(of_position.values, of_position.rates, pair.dt, whole=True)
-            also = position.slope if position.unexplained < 0.2 else None
-            found = _over_windows(of_speed, speed, _relations(pair, other)[1], pair, also)
+        found = _broken(speed, of_speed, position.measured(whole=True))
         if found is not None:
             return found
-    relation = _gap_relation(pair)
-    found = _over_windows(relation, relation.measured(pair.dt), None, pair, None)
+    found = _over_windows(_gap_relation(pair), None, None)
     return None if found is None else _by_gap(found, pair, units or {})
 
 
-def _wrong_distance(
-    relation: _Relation, pair: Pair, other_slope: float | None
-) -> Contradiction | None:
-    """Returns that the distance driven over the whole pair is not what the speeds say."""
-    whole = agreement(relation.values, relation.rates, pair.dt, whole=True)
-    if not _WHOLE.breaks_slope(whole):
-        return None
-    return Contradiction(relation.signals, relation.quantity, whole.slope, "", pair.dt, other_slope)
+def _broken(relation: _Relation, other: _Relation, also: Agreement) -> Contradiction | None:
+    """Returns that a signal is not what its rate says; `also` is of this vehicle's other signal."""
+    found = _leap(relation) or _constant(relation)
+    if found is not None:
+        return found
+    if relation.quantity == "position":
+        whole = relation.measured(whole=True)
+        if _WHOLE.breaks_slope(whole):
+            return relation.broken(whole.slope, also=also)
+    return _over_windows(relation, other, also)
 
 
 def _over_windows(
-    relation: _Relation,
-    found: Agreement,
-    other: _Relation | None,
-    pair: Pair,
-    other_slope: float | None,
+    relation: _Relation, other: _Relation | None, also: Agreement | None
 ) -> Contradiction | None:
-    """Returns that a signal's changes over windows are not what its rate says.
-
-    Args:
-        found: how they agree.
-        other: the same of the other vehicle.
-        other_slope: see `Contradiction`.
-    """
-    rule = _RULES[relation.quantity]
-    slope, words = None, ""
+    """Returns that a signal's changes over windows are not what its rate says; as `_broken`."""
+    rule, found = _RULES[relation.quantity], relation.measured()
     if rule.breaks_slope(found):
-        slope = found.slope
-    elif rule.leaves_over(found):
-        why = _why_left_over(relation, other, pair.dt, found.left)
-        if not why and found.left < rule.left:
-            return None
-        words = (
-            f"over {_WINDOW_S:g} s the one changes otherwise than the other says, by"
-            f" {found.left:.0%} of the change:"
-            f" {why or 'are they of this vehicle, at this time?'}"
-        )
-    else:
+        return relation.broken(found.slope, also=also)
+    if not rule.leaves_over(found):
         return None
-    return Contradiction(relation.signals, relation.quantity, slope, words, pair.dt, other_slope)
+    why = _why_left_over(relation, other, found.left)
+    if not why and found.left < rule.left:
+        return None
+    words = (
+        f"over {_WINDOW_S:g} s the one changes otherwise than the other says, by"
+        f" {found.left:.0%} of the change: {why or 'are they of this vehicle, at this time?'}"
+    )
+    return relation.broken(None, words)
 
 
-def _why_left_over(relation: _Relation, other: _Relation | None, dt: float, share: float) -> str:
+def _why_left_over(relation: _Relation, other: _Relation | None, share: float) -> str:
     """Returns why a signal does not go with its rate: another vehicle's, or late; "" if unknown."""
+    dt = relation.pair.dt
     if other is not None and agreement(relation.values, other.rates, dt).left < share / 3:
         return f"they go with {other.signals.partition(' and ')[2]}: are the columns swapped?"
     late, rest = 0, share
@@ -368,17 +387,9 @@ def _why_left_over(relation: _Relation, other: _Relation | None, dt: float, shar
     return ""
 
 
-def _single_frames(relation: _Relation, pair: Pair) -> Contradiction | None:
-    """Returns that a few frames, or all of a signal, hold what is no recording."""
-    return _leap(relation, pair) or _constant(relation, pair)
-
-
-def _leap(relation: _Relation, pair: Pair) -> Contradiction | None:
-    """Returns the first of a few steps from frame to frame that no vehicle makes.
-
-    Where there are many, a unit is wrong.
-    """
-    moved = np.diff(relation.values)
+def _leap(relation: _Relation) -> Contradiction | None:
+    """Returns the first of a few steps that no vehicle makes; of many, a unit is wrong."""
+    pair, moved = relation.pair, np.diff(relation.values)
     most, rate = _LEAP_MPS + _LEAP_MPS2 * pair.dt, _MOST_MPS2
     if relation.quantity == "position":
         moved = moved - 0.5 * (relation.rates[1:] + relation.rates[:-1]) * pair.dt
@@ -395,24 +406,22 @@ def _leap(relation: _Relation, pair: Pair) -> Contradiction | None:
         f"at frame {frame} {what} within a step of {pair.dt:.3g} s ({len(at)} such steps): cut the"
         " pair there, or correct it"
     )
-    return Contradiction(relation.signals, relation.quantity, None, words, pair.dt)
+    return relation.broken(None, words)
 
 
-def _constant(relation: _Relation, pair: Pair) -> Contradiction | None:
+def _constant(relation: _Relation) -> Contradiction | None:
     """Returns that one signal is the same in all frames although the other says otherwise."""
     same = [bool((one == one[0]).all()) for one in (relation.values, relation.rates)]
     if same[0] == same[1]:
         return None
-    whole = agreement(relation.values, relation.rates, pair.dt, whole=True)
-    if same[1] and relation.quantity == "position":
-        # Positions grow at a constant speed, too.
-        whole = agreement(relation.values, relation.rates, pair.dt)
+    # Positions grow at a constant speed, too.
+    whole = relation.measured(whole=not (same[1] and relation.quantity == "position"))
     if whole.spread < 2 * _RULES[relation.quantity].spread or whole.left < 0.5:
         return None
     name = relation.signals.split(" and ")[same.index(True)]
     value = (relation.values, relation.rates)[same.index(True)][0]
     words = f"{name} is {value:.3g} in every frame, and the other changes"
-    return Contradiction(relation.signals, relation.quantity, None, words, pair.dt)
+    return relation.broken(None, words)
 
 
 def _by_gap(found: Contradiction, pair: Pair, units: Units) -> Contradiction:
@@ -428,7 +437,7 @@ def _by_gap(found: Contradiction, pair: Pair, units: Units) -> Contradiction:
         leader + follower,
         follower,
     )
-    slope = _gap_relation(pair).measured(pair.dt).slope
+    slope = _gap_relation(pair).measured().slope
     of_all: dict[str, float] = {}
     for unit in _LIKELY["gap"]:
         if unit == own["gap"]:
@@ -460,21 +469,6 @@ def _has_gaps_alone(pair: Pair) -> bool:
     """Says whether positions follow from gaps and speeds, as where a file has none."""
     left = pair.leader_position - pair.leader_length - driven(pair.leader_speed, pair.dt)
     return bool(np.abs(left).max() < 1e-6)
-
-
-def _why_gap(gap: float, units: Units) -> str:
-    """Returns why a gap does not change as the relative speed says."""
-    own = _units_of("follower", units)
-    known = {-1.0: "the leader's and the follower's columns look swapped"}
-    known |= _factors(own, slower=("gap",), faster=("speed",))
-    reason = _named(gap, known, _SAME_GAP)
-    return (
-        f"the gap changes {gap:.3g} times as the relative speed says: {reason or _gap_units(own)}"
-    )
-
-
-def _gap_units(own: Units) -> str:
-    return f"gaps must be in {own['gap']}, speeds in {own['speed']}, times in {own['time']}"
 
 
 def _units_of(who: str, units: Units) -> dict[str, str]:
@@ -515,49 +509,6 @@ def _factors(
     return found
 
 
-def _why_position(position: float, speed: float | None, dt: float, own: Units) -> str:
-    """Returns why a distance is not speed times time, from that and the slope of the speed."""
-    if position < 0:
-        return "positions must grow along the lane"
-    if speed is not None and abs(speed / position - 1) < _SAME:
-        return (
-            f"speeds change as much faster than the accelerations say, so the time step looks like"
-            f" {position * dt:.3g} s, not {dt:.3g} s"
-        )
-    reason = _named(position, _factors(own, faster=("speed", "time"), slower=("position",)))
-    return reason or (
-        f"positions must be in {own['position']}, speeds in {own['speed']}, times in"
-        f" {own['time']}, and all of this vehicle"
-    )
-
-
-def _why_speed(slope: float, position: float | None, dt: float, own: Units) -> str:
-    """Returns why a speed does not change as the acceleration says.
-
-    Args:
-        position: slope of the position on the speed.
-    """
-    said = f"speeds change {slope:.3g} times as much as the accelerations say"
-    if position is not None and abs(position - 1) > _TYPICAL and abs(slope / position - 1) < _SAME:
-        return (
-            f"{said}, and positions as much more than the speeds say, so the time step looks like"
-            f" {slope * dt:.3g} s, not {dt:.3g} s"
-        )
-    known = _ACCELERATION_FACTORS | _factors(own, faster=("acceleration",), slower=("speed",))
-    reason = _named(slope, known)
-    if reason is None:
-        reason = f"they are {1 / slope:.2g} times what the speeds say; write m/s2"
-    return f"{said}: {reason}"
-
-
-def _named(factor: float, known: dict[float, str], room: float = _SAME) -> str | None:
-    """Returns what is known of the nearest factor, if it is near."""
-    nearest = min(known, key=lambda one: abs(factor / one - 1))
-    if abs(factor / nearest - 1) < room:
-        return known[nearest]
-    return None
-
-
 def contradictions(
     pairs: PairSet, units: Units | None = None
 ) -> Iterator[tuple[str, Contradiction]]:
@@ -579,11 +530,11 @@ def typical_contradiction(pairs: PairSet) -> Contradiction | None:
         relations = (*_relations(pair, "leader"), *_relations(pair, "follower"))
         for one in (*relations, _gap_relation(pair)):
             key = one.signals, one.quantity
-            found, rule = one.measured(pair.dt), _RULES[one.quantity]
+            found, rule = one.measured(), _RULES[one.quantity]
             if found.change >= 2 * rule.spread:
                 left.setdefault(key, []).append(found.left)
             if one.quantity == "position":
-                found, rule = agreement(one.values, one.rates, pair.dt, whole=True), _WHOLE
+                found, rule = one.measured(whole=True), _WHOLE
             if found.spread >= rule.spread and found.slope > 0:
                 slopes.setdefault(key, []).append(math.log(found.slope))
     for key, logs in slopes.items():

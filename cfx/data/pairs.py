@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.core import scratch
+from cfx.core import memory
 from cfx.core.errors import DataError
 
 if TYPE_CHECKING:
@@ -160,19 +160,22 @@ class LearnedFrom:
     """
 
     def __init__(self, likenesses: Iterable[str]) -> None:
-        found: dict[str, list[list[float]]] = {}
+        found: dict[str, list[Array]] = {}
         for one in likenesses:
-            frames, step, *numbers = one.split()
-            found.setdefault(f"{frames} {step}", []).append([float(value) for value in numbers])
+            length, numbers = _numbers(one)
+            found.setdefault(length, []).append(numbers)
         self._known = {length: np.array(numbers) for length, numbers in found.items()}
 
     def __contains__(self, pair: Pair) -> bool:
-        frames, step, *numbers = pair.likeness.split()
-        known = self._known.get(f"{frames} {step}")
-        if known is None:
-            return False
-        differences = np.abs(known - np.array([float(value) for value in numbers]))
-        return bool((differences <= _ALIKE).all(1).any())
+        length, numbers = _numbers(pair.likeness)
+        known = self._known.get(length)
+        return known is not None and bool((np.abs(known - numbers) <= _ALIKE).all(1).any())
+
+
+def _numbers(likeness: str) -> tuple[str, Array]:
+    """Returns a likeness's frames and time step, and its speeds and gaps, `(24,)`."""
+    frames, step, *numbers = likeness.split()
+    return f"{frames} {step}", np.array(numbers, dtype=np.float64)
 
 
 def twins(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
@@ -180,15 +183,15 @@ def twins(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
 
     Pairs whose speed hardly changes, and short ones, are none: many may drive so.
     """
-    by_length: dict[str, list[tuple[int, list[str]]]] = {}
+    by_length: dict[str, list[tuple[int, Array]]] = {}
     for at, pair in enumerate(pairs):
-        frames, step, *numbers = pair.likeness.split()
-        speeds = [float(value) for value in numbers[_LIKENESS_FRAMES : 2 * _LIKENESS_FRAMES]]
+        length, numbers = _numbers(pair.likeness)
+        speeds = numbers[_LIKENESS_FRAMES : 2 * _LIKENESS_FRAMES]
         if len(pair) >= _TELLING_FRAMES and np.ptp(speeds) > _LIVELY_MPS:
-            by_length.setdefault(f"{frames} {step}", []).append((at, numbers))
+            by_length.setdefault(length, []).append((at, numbers))
     found = []
     for same in by_length.values():
-        values = np.array([numbers for _, numbers in same], dtype=np.float64)
+        values = np.array([numbers for _, numbers in same])
         order = np.argsort(values.sum(1))
         values, total = values[order], values.sum(1)[order]
         for further in range(1, len(same)):
@@ -244,7 +247,7 @@ class PairSet(Sequence[Pair]):
     def __iter__(self) -> Iterator[Pair]:
         for start in range(0, len(self.pairs), _TOGETHER):
             yield from self.pairs[start : start + _TOGETHER]
-            scratch.release()
+            memory.release()
 
     @property
     def size(self) -> int:
@@ -257,7 +260,7 @@ class PairSet(Sequence[Pair]):
         Raises:
             OutputError: the disk of temporary files is full.
         """
-        is_large = self.size >= scratch.LARGE
+        is_large = self.size >= memory.LARGE
         changed: list[Pair] = []
         for start in range(0, len(self.pairs), _TOGETHER):
             part = []
@@ -267,7 +270,7 @@ class PairSet(Sequence[Pair]):
                     part.append(made)
             some = replace(self, pairs=tuple(part))
             changed += some.in_file() if is_large else some
-            scratch.release()
+            memory.release()
         return replace(self, pairs=tuple(changed))
 
     def in_file(self) -> PairSet:
@@ -276,20 +279,19 @@ class PairSet(Sequence[Pair]):
         Raises:
             OutputError: the disk is full.
         """
-        rows = [len(SIGNALS) + len(pair.truth) for pair in self.pairs]
-        sizes = [count * len(pair) for count, pair in zip(rows, self.pairs, strict=True)]
-        values = scratch.in_file((sum(sizes),))
-        ends = np.cumsum(sizes)
+        sizes = [len(pair) * (len(SIGNALS) + len(pair.truth)) for pair in self.pairs]
+        free = memory.in_file((sum(sizes),))
         stored = []
-        for pair, count, size, end in zip(self, rows, sizes, ends.tolist(), strict=True):
-            own = values[end - size : end].reshape(count, len(pair))
-            arrays = {name: getattr(pair, name) for name in SIGNALS}
-            kept = {}
-            for row, (name, array) in zip(own, (arrays | dict(pair.truth)).items(), strict=True):
-                row[:] = array
-                kept[name] = row
-            signals: dict[str, Any] = {name: kept[name] for name in SIGNALS}
-            truth = {name: kept[name] for name in pair.truth}
+
+        def kept(array: Array) -> Array:
+            nonlocal free
+            row, free = free[: len(array)], free[len(array) :]
+            row[:] = array
+            return row
+
+        for pair in self:
+            signals: dict[str, Any] = {name: kept(getattr(pair, name)) for name in SIGNALS}
+            truth = {name: kept(array) for name, array in pair.truth.items()}
             stored.append(replace(pair, **signals, truth=truth))
         return replace(self, pairs=tuple(stored))
 
@@ -299,14 +301,10 @@ class PairSet(Sequence[Pair]):
 
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:
         """Keeps the pairs marked True and counts the others under `reason`."""
-        kept = []
-        for pair, wanted in zip(self.pairs, keep, strict=True):
-            if wanted:
-                kept.append(pair)
+        kept = tuple(pair for pair, wanted in zip(self.pairs, keep, strict=True) if wanted)
         lost = len(self.pairs) - len(kept)
-        if lost == 0:
-            return replace(self, pairs=tuple(kept))
-        return replace(self, pairs=tuple(kept), dropped=(*self.dropped, Dropped(reason, lost)))
+        dropped = (Dropped(reason, lost),) if lost else ()
+        return replace(self, pairs=kept, dropped=(*self.dropped, *dropped))
 
     @property
     def dt(self) -> float:
@@ -335,7 +333,7 @@ class PairSet(Sequence[Pair]):
 
 @dataclass(frozen=True)
 class PairBatch:
-    """Pairs as padded tensors; those of many pairs lie in files (`cfx.core.scratch`).
+    """Pairs as padded tensors; those of many pairs lie in files (`cfx.core.memory`).
 
     Beyond its end a pair is continued at its last speed with zero acceleration, so that a rollout
     stays finite there; `mask` says what is real. Positions are relative to the follower's first
@@ -384,13 +382,13 @@ class PairBatch:
         signals = {}
         for name in SIGNALS:
             # Filled row by row: a list of rows would hold the signal twice.
-            values = scratch.empty(shape, together=len(SIGNALS))
+            values = memory.empty(shape, together=len(SIGNALS))
             for row, pair in zip(values, pair_set, strict=True):
                 row[:] = _extend(pair, name, length)
             signals[name] = torch.as_tensor(values).to(device=device, dtype=dtype)
         leader_lengths = [pair.leader_length for pair in pair_set.pairs]
         lengths = torch.tensor([len(pair) for pair in pair_set.pairs])
-        mask = torch.as_tensor(scratch.empty(shape, bool))
+        mask = torch.as_tensor(memory.empty(shape, bool))
         torch.lt(torch.arange(length), lengths[:, None], out=mask)
         return cls(
             **signals,
@@ -435,7 +433,7 @@ class PairBatch:
     def __getitem__(self, index: Any) -> PairBatch:
         """Selects pairs (a slice, an index tensor or a boolean mask over P); time stays whole."""
         chosen = self._changed(lambda values: _selected(values, index))
-        scratch.release()
+        memory.release()
         return chosen
 
     def _changed(self, change: Callable[[Tensor], Tensor]) -> PairBatch:
@@ -448,29 +446,21 @@ class PairBatch:
 
 
 def _selected(values: Tensor, index: Any) -> Tensor:
-    """Returns rows of values `(P, ...)`; many rows lie in a file, as those that they are copies of.
-
-    Args:
-        values: of all pairs.
-        index: a slice, an index tensor, or a boolean mask `(P,)`.
-    """
+    """Returns rows of values `(P, ...)`, in a file if they are many."""
     import torch
 
     is_copy = isinstance(index, torch.Tensor) and index.dtype == torch.int64 and values.ndim == 2
     if not is_copy or values.device.type != "cpu":
         return values[index]
     size = len(index) * values.shape[1] * values.itemsize
-    if len(SIGNALS) * size < scratch.LARGE:
+    if len(SIGNALS) * size < memory.LARGE:
         return values[index]
-    rows = scratch.in_file((len(index), values.shape[1]), values[:0].numpy().dtype)
+    rows = memory.in_file((len(index), values.shape[1]), values[:0].numpy().dtype)
     return torch.index_select(values, 0, index, out=torch.as_tensor(rows))
 
 
 def _extend(pair: Pair, name: str, length: int) -> Array:
-    """Returns a signal `(length,)`, continued at constant speed.
-
-    Positions are relative to the follower's first.
-    """
+    """Returns a signal `(length,)`, continued at constant speed; the follower starts at 0 m."""
     values = np.asarray(getattr(pair, name), dtype=np.float64)
     missing = length - len(values)
     tail: Array

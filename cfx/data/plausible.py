@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.data.files import Floats
 from cfx.data.pairs import Pair, PairSet, twins
 from cfx.data.style import STANDING_MPS
 
@@ -38,14 +37,18 @@ def doubts(pairs: PairSet) -> Iterator[str]:
     if length > _LONG_M:
         yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
     if len(pairs) >= _MANY:
-        harsh = float(np.median([_ninth_tenth(pair.follower_acceleration) for pair in pairs]))
+        nine_tenths = [np.quantile(np.abs(pair.follower_acceleration), 0.9) for pair in pairs]
+        harsh = float(np.median(nine_tenths))
         if harsh > _HARSH_MPS2:
             yield (
                 f"accelerations are typically large (a tenth above {harsh:.1f} m/s2): are the"
                 " file's lengths, speeds and accelerations in feet, or its times wrong?"
             )
-    standing = [_standing_gap(pair) for pair in pairs]
-    gaps = [gap for gap in standing if gap is not None]
+    gaps = []
+    for pair in pairs:
+        stands = pair.follower_speed < STANDING_MPS
+        if stands.any():
+            gaps.append(np.min(pair.gap[stands]))
     if len(gaps) >= _MANY and np.median(gaps) > _STANDING_GAP_M:
         yield (
             f"vehicles that stand are typically {np.median(gaps):.1f} m behind their leaders: are"
@@ -75,16 +78,6 @@ def rare(pairs: PairSet) -> Iterator[str]:
     """Yields a sentence for each kind of frames that recordings have, but few."""
     for what, wrong in _RARE.items():
         yield from _counted(pairs, what, wrong)
-
-
-def _ninth_tenth(values: Floats) -> float:
-    return float(np.quantile(np.abs(values), 0.9))
-
-
-def _standing_gap(pair: Pair) -> float | None:
-    """Returns the gap at which a follower stands; None if they never do."""
-    stands = pair.follower_speed < STANDING_MPS
-    return float(np.min(pair.gap[stands])) if stands.any() else None
 
 
 def _jumps(pair: Pair) -> Marks:
@@ -118,22 +111,6 @@ def _is_frozen(pair: Pair) -> Marks:
     return frozen
 
 
-def _is_close(pair: Pair) -> Marks:
-    return pair.gap < 0.5
-
-
-def _is_fast(pair: Pair) -> Marks:
-    return np.maximum(pair.leader_speed, pair.follower_speed) > 50
-
-
-def _is_harsh(pair: Pair) -> Marks:
-    return np.abs(pair.follower_acceleration) > 8
-
-
-def _reverses(pair: Pair) -> Marks:
-    return np.diff(pair.follower_position) < 0
-
-
 _DOUBTFUL: Mapping[str, Callable[[Pair], Marks]] = {
     "steps in which a position moves 1 m more or less than its speed says": _jumps,
     "steps in which a speed jumps as no vehicle's does": _speed_jumps,
@@ -142,10 +119,14 @@ _DOUBTFUL: Mapping[str, Callable[[Pair], Marks]] = {
     ),
 }
 _RARE: Mapping[str, Callable[[Pair], Marks]] = {
-    "frames with a gap below 0.5 m": _is_close,
-    "frames with a speed above 50 m/s": _is_fast,
-    "frames with an acceleration or braking above 8 m/s2": _is_harsh,
-    "steps in which a vehicle moves backwards": _reverses,
+    "frames with a gap below 0.5 m": lambda pair: pair.gap < 0.5,
+    "frames with a speed above 50 m/s": lambda pair: (
+        np.maximum(pair.leader_speed, pair.follower_speed) > 50
+    ),
+    "frames with an acceleration or braking above 8 m/s2": lambda pair: (
+        np.abs(pair.follower_acceleration) > 8
+    ),
+    "steps in which a vehicle moves backwards": lambda pair: np.diff(pair.follower_position) < 0,
 }
 """What is counted, and which frames or steps of a pair count."""
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Annotated
@@ -60,9 +59,9 @@ def with_sites(pairs: PairSet, names: SiteNames) -> PairSet:
     for pair in pairs:
         key = (pair.recording, pair.site)
         if key not in found:
-            pattern = _pattern(names, key)
-            used.add(pattern)
-            found[key] = None if pattern is None else names[pattern]
+            fits = [one for one in names if any(fnmatchcase(name, one) for name in key)]
+            used.update(fits[:1])
+            found[key] = names[fits[0]] if fits else None
     unnamed = [recording for (recording, _), site in found.items() if site is None]
     if unnamed:
         raise DataError(
@@ -80,13 +79,6 @@ def with_sites(pairs: PairSet, names: SiteNames) -> PairSet:
         return replace(pair, site=found[pair.recording, pair.site] or "")
 
     return replace(pairs, pairs=tuple(named(pair) for pair in pairs))
-
-
-def _pattern(names: Mapping[str, str], of_pair: tuple[str, str]) -> str | None:
-    for pattern in names:
-        if any(fnmatchcase(name, pattern) for name in of_pair):
-            return pattern
-    return None
 
 
 def with_vehicles(pairs: PairSet, pattern: str | None) -> PairSet:

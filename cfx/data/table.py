@@ -11,12 +11,13 @@ Rows are numbered as an editor shows them: the header is row 1 (blank lines are 
 from __future__ import annotations
 
 import contextlib
+import csv
 import io
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, cast
 
 import numpy as np
 import pandas as pd
@@ -26,8 +27,8 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cfx.core.errors import DataError, listed, nearest
-from cfx.data.files import PARQUET, Floats, Ints, magic, read_head, unpacked_blocks
+from cfx.core.errors import DataError, first_line, listed, nearest
+from cfx.data.files import PARQUET, Floats, Ints, magic, open_text, read_head, unpacking
 
 if TYPE_CHECKING:
     from numpy import bool_
@@ -36,7 +37,6 @@ _BLOCK = 1 << 22
 """Bytes that are parsed at once."""
 
 _UTF16 = (b"\xff\xfe", b"\xfe\xff")
-_UTF8_MARK = b"\xef\xbb\xbf"
 _OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
 _ABSENT = ("", "nan", "na", "null", "none", "n/a", "#n/a")
 """Cells that stand for no number, in small letters."""
@@ -223,7 +223,6 @@ class Table:
         labels: columns of names `(N,)`.
         first_row: the number of the first row in messages.
         ignored: names of the columns that are not part of the layout.
-        titles: what messages call the columns that the file calls otherwise than the layout.
     """
 
     source: str
@@ -232,7 +231,6 @@ class Table:
     labels: Mapping[str, Labels]
     first_row: int
     ignored: Sequence[str]
-    titles: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
         for values in self.numbers.values():
@@ -262,7 +260,7 @@ class Table:
 
     def title(self, column: str) -> str:
         """Returns what messages call a column."""
-        return self.titles.get(column, column)
+        return next((one.title for one in self.layout.columns if one.name == column), column)
 
     def refuse(self, column: str, wrong: NDArray[bool_], why: str) -> None:
         """Raises DataError if any cell of a column of numbers is wrong; names the first.
@@ -307,18 +305,15 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
         stored = file.schema_arrow.names
         more = {name: value for name, value in (given or {}).items() if name not in stored}
         found = layout.found_in(str(path), [*stored, *more])
-        columns = file.read(
-            columns=[stored[one.at] for one in found.values() if one.at < len(stored)]
-        )
+        wanted = [stored[one.at] for one in found.values() if one.at < len(stored)]
+        columns = file.read(columns=wanted)
         for name, value in more.items():
             columns = columns.append_column(name, pa.array([value] * len(columns)))
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise DataError(
-            f"{path}: the parquet file is cut off or damaged ({_first_line(error)}); write it again"
+            f"{path}: the parquet file is cut off or damaged ({first_line(error)}); write it again"
         ) from None
-    names = [*stored, *more]
-    by_name = {own: columns.column(names[one.at]) for own, one in found.items()}
-    return _checked(_Columns(str(path), layout, found, 1), by_name, names)
+    return _checked(_Source(str(path), layout, [*stored, *more], 1), found, columns)
 
 
 def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
@@ -337,70 +332,51 @@ def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
         columns = pa.Table.from_pandas(wanted, preserve_index=False)
     except pa.ArrowException as error:
         raise DataError(
-            f"{source}: a column mixes numbers and text ({_first_line(error)});"
+            f"{source}: a column mixes numbers and text ({first_line(error)});"
             " give each column one type"
         ) from None
-    by_name = {own: columns.column(names[one.at]) for own, one in found.items()}
-    return _checked(_Columns(source, layout, found, 1), by_name, names)
+    return _checked(_Source(source, layout, names, 1), found, columns)
 
 
 # --- cells ----------------------------------------------------------------------------------------
 
 
-class _Columns(NamedTuple):
-    """The columns of a layout that a source has."""
+class _Source(NamedTuple):
+    """Where columns come from, and the names of all that are there."""
 
-    source: str
+    name: str
     layout: Layout
-    found: Mapping[str, _Found]
+    columns: Sequence[str]
     first_row: int
 
 
-def _checked(here: _Columns, columns: Mapping[str, Any], names: Sequence[str]) -> Table:
-    """Returns Arrow columns as a table of numbers and names.
-
-    Args:
-        columns: those of the layout, by its names.
-        names: of all columns of the source.
-
-    Raises:
-        DataError: a cell is wrong, or there is none.
-    """
-    numbers = {}
-    labels = {}
-    for name, one in here.found.items():
-        if one.column.is_name:
-            labels[name] = _labels(here, one.column.title, columns[name])
-        else:
-            numbers[name] = _floats(here, one.column.title, columns[name])
-    used = {one.at for one in here.found.values()}
+def _checked(source: _Source, found: Mapping[str, _Found], columns: Any) -> Table:
+    """Returns Arrow columns as a table of numbers and names, in the layout's units."""
+    used = {one.at for one in found.values()}
     ignored = []
-    for at, name in enumerate(names):
+    for at, name in enumerate(source.columns):
         if at not in used and name != _PANDAS_INDEX:
             ignored.append(name if name not in {"", "None"} else f"column {at + 1} without a name")
-    titles = {}
-    for name, one in here.found.items():
-        if one.column.title != name:
-            titles[name] = one.column.title
-    table = Table(here.source, here.layout, numbers, labels, here.first_row, ignored, titles)
+    numbers: dict[str, Floats] = {}
+    labels: dict[str, Labels] = {}
+    table = Table(source.name, source.layout, numbers, labels, source.first_row, ignored)
+    for name, one in found.items():
+        cells = columns.column(source.columns[one.at])
+        if one.column.is_name:
+            labels[name] = _labels(table, name, cells)
+        else:
+            numbers[name] = _floats(table, name, cells)
     if not len(table):
-        raise DataError(f"{here.source}: has the right columns but no rows")
+        raise DataError(f"{source.name}: has the right columns but no rows")
     for name, own in labels.items():
-        if not here.found[name].column.may_be_empty:
+        if not found[name].column.may_be_empty:
             _require_names(table, name, own)
     for name, values in numbers.items():
-        _require_numbers(table, name, values, here.found[name].column)
-    return _converted(table, here)
-
-
-def _converted(table: Table, here: _Columns) -> Table:
-    """Returns a table whose numbers are in the layout's units."""
-    numbers = dict(table.numbers)
-    for name, values in table.numbers.items():
-        factor = here.found[name].column.factor
-        if factor != 1.0:
-            numbers[name] = values * factor
-    return replace(table, numbers=numbers)
+        _require_numbers(table, name, values, found[name].column)
+    for name, one in found.items():
+        if one.column.factor != 1.0:
+            numbers[name] = numbers[name] * one.column.factor
+    return table
 
 
 def _require_names(table: Table, name: str, labels: Labels) -> None:
@@ -433,15 +409,9 @@ def _require_numbers(table: Table, name: str, values: Floats, column: Column) ->
 _THOUSANDS = r"^[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?$"
 
 
-def _floats(here: _Columns, name: str, column: Any) -> Floats:
-    """Returns an Arrow column as numbers `(N,)`.
-
-    "1,234" is read as 1234, "1,2" and "0,234" are no numbers, and an empty cell is NaN.
-
-    Raises:
-        DataError: a cell is no number, or the column holds something else.
-    """
-    where = f"{here.source}, column {name}"
+def _floats(table: Table, name: str, column: Any) -> Floats:
+    """Returns an Arrow column as numbers `(N,)`: 1234 for "1,234", NaN for an empty cell."""
+    where = f"column {table.title(name)}"
     if pa.types.is_dictionary(column.type):
         column = column.cast(column.type.value_type)
     if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
@@ -449,7 +419,7 @@ def _floats(here: _Columns, name: str, column: Any) -> Floats:
             return cast(Floats, column.cast(pa.float64()).to_numpy())
         except (pa.ArrowException, ValueError):
             raise DataError(
-                f"{where}: holds {column.type}, not numbers; write it as numbers"
+                f"{table.source}, {where}: holds {column.type}, not numbers; write it as numbers"
             ) from None
     trimmed = pc.utf8_trim_whitespace(column)
     grouped = pc.match_substring_regex(trimmed, _THOUSANDS)
@@ -469,29 +439,24 @@ def _floats(here: _Columns, name: str, column: Any) -> Floats:
         elif "-" in written[1:] and ":" in written:
             remedy = "write the seconds since a frame of your choice"
         raise DataError(
-            f"{here.source}, row {row + here.first_row}, column {name}: '{written}' is not a"
-            f" number; {remedy}"
+            f"{table.source}, row {table.row(row)}, {where}: '{written}' is not a number; {remedy}"
         )
     return values
 
 
-def _labels(here: _Columns, name: str, column: Any) -> Labels:
-    """Returns an Arrow column as names, in the order in which they first appear.
-
-    Raises:
-        DataError: it holds something else, or bytes that are no UTF-8.
-    """
-    where = f"column {name}"
+def _labels(table: Table, name: str, column: Any) -> Labels:
+    """Returns an Arrow column as names, in the order in which they first appear."""
+    where = f"column {table.title(name)}"
     if pa.types.is_nested(column.type):
         raise DataError(
-            f"{here.source}, {where}: holds {column.type}, not names; write a text or a number in"
+            f"{table.source}, {where}: holds {column.type}, not names; write a text or a number in"
             " each row"
         )
     try:
         column.validate(full=True)
     except pa.ArrowException:
         raise DataError(
-            f"{here.source}{_first_broken(column)}, {where}: is no text in UTF-8; write the file"
+            f"{table.source}{_first_broken(column)}, {where}: is no text in UTF-8; write the file"
             " again in UTF-8"
         ) from None
     if pa.types.is_floating(column.type):  # 11.0, as pandas writes 11 beside a missing id
@@ -526,13 +491,6 @@ def _first_broken(column: Any) -> str:
     return ""
 
 
-def _first_line(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    if not lines:
-        return type(error).__name__
-    return lines[0]
-
-
 # --- delimited text -------------------------------------------------------------------------------
 
 
@@ -553,25 +511,17 @@ class _Text(NamedTuple):
 
 def _read_text(path: Path, layout: Layout) -> Table:
     text = _read_header(path, layout)
-    where = str(path)
-    found = layout.found_in(where, text.names)
+    found = layout.found_in(str(path), text.names)
     try:
         columns = _parsed(text, found, pa.float64())
     except pa.ArrowInvalid:
         # Some cell is no plain number: read these columns as text and look closer.
         columns = _parsed(text, found, pa.string())
-    by_name = {own: columns.column(f"c{one.at}") for own, one in found.items()}
-    here = _Columns(where, layout, found, text.skipped + 1)
-    return _checked(here, by_name, text.names)
+    return _checked(_Source(str(path), layout, text.names, text.skipped + 1), found, columns)
 
 
 def _read_header(path: Path, layout: Layout) -> _Text:
-    """Reads the header and the separator of a text file.
-
-    Raises:
-        DataError: it is no text in UTF-8, its columns are separated by what the layout does not
-            allow, or they have no names.
-    """
+    """Reads the header and the separator of a text file."""
     head = read_head(path)
     if head.startswith(_UTF16):
         raise DataError(f"{path}: is in UTF-16; save it as UTF-8")
@@ -586,7 +536,7 @@ def _read_header(path: Path, layout: Layout) -> _Text:
     own = next((separator for separator in layout.separators if separator in first), "")
     if own:
         delimiter = own
-        cells = _cells(first, own)
+        cells = [cell.strip() for cell in next(csv.reader([first], delimiter=own))]
     else:
         for separator, plural in _OTHER_SEPARATORS.items():
             if separator in first and not (separator == "\t" and not has_header):
@@ -616,16 +566,6 @@ def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, 
     )
 
 
-def _cells(line: str, delimiter: str) -> list[str]:
-    """Returns the cells of one line of CSV."""
-    options = pa.csv.ReadOptions(autogenerate_column_names=True)
-    how = pa.csv.ParseOptions(delimiter=delimiter)
-    file = io.BytesIO(line.encode() + b"\n")
-    table = pa.csv.read_csv(file, read_options=options, parse_options=how)
-    (row,) = table.to_pylist()
-    return [str(cell).strip() for cell in row.values()]
-
-
 def _decoded(path: Path, head: bytes) -> str:
     """Returns the beginning of a file as text; raises DataError if it is none."""
     is_binary = any(byte < 32 and byte not in b"\t\n\r\f" for byte in head)
@@ -645,7 +585,7 @@ def _decoded(path: Path, head: bytes) -> str:
 
 
 def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:
-    """Returns the columns found as one Arrow table with columns c0, c1, ...
+    """Returns the columns found as one Arrow table.
 
     Args:
         spare: columns without a name behind the others: 1 where rows end in a comma.
@@ -682,9 +622,10 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
         "convert_options": pa.csv.ConvertOptions(column_types=types, include_columns=list(types)),
     }
     try:
-        with _Lines(text) as lines, pa.PythonFile(lines, mode="r") as file:
+        with open_text(text.path) as file, unpacking(text.path):
+            source = _Commas(file) if text.delimiter == " " else file
             # Not open_csv: after an error its threads may wait for one another when Python exits.
-            table = pa.csv.read_csv(file, **options)
+            table = pa.csv.read_csv(source, **options)
     except pa.ArrowInvalid as error:
         if broken:
             row = broken[0]
@@ -706,45 +647,26 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
                 f"{text.path}, row {row + text.skipped + 1}: '{nameless[row]}' stands behind the"
                 f" last of {len(text.names)} columns; does a cell hold a separator?"
             )
-    return table
+    kept = {f"c{one.at}": text.names[one.at] for one in found.values()}
+    return table.select(list(kept)).rename_columns(list(kept.values()))
 
 
-class _Lines(io.RawIOBase):
-    """Feed pyarrow whole lines; white space that separates columns is turned into commas."""
+class _Commas(io.RawIOBase):
+    """A text with commas in place of the white space that separates its cells."""
 
-    def __init__(self, text: _Text) -> None:
+    def __init__(self, file: BinaryIO) -> None:
         super().__init__()
-        self._parts = self._whole_lines(text)
+        self._file = file
         self._ready = b""
 
     def readable(self) -> bool:
         return True
 
     def readinto(self, buffer: Any) -> int:
-        while not self._ready:
-            part = next(self._parts, None)
-            if part is None:
-                return 0
-            self._ready = part
+        if not self._ready:
+            lines = b"".join(self._file.readlines(_BLOCK)).splitlines()
+            self._ready = b"".join(b",".join(line.split()) + b"\n" for line in lines)
         size = min(len(buffer), len(self._ready))
         buffer[:size] = self._ready[:size]
         self._ready = self._ready[size:]
         return size
-
-    @staticmethod
-    def _whole_lines(text: _Text) -> Iterator[bytes]:
-        """Yields parts of the file that end where a line does."""
-        rest = b""
-        mark = _UTF8_MARK
-        for block in unpacked_blocks(text.path):
-            lines, end, rest = (rest + block.removeprefix(mark)).rpartition(b"\n")
-            mark = b""
-            yield _with_commas(lines + end, text.delimiter)
-        yield _with_commas(rest, text.delimiter)
-
-
-def _with_commas(lines: bytes, delimiter: str) -> bytes:
-    """Returns lines with commas in place of white space, where that separates their cells."""
-    if delimiter != " ":
-        return lines
-    return b"".join(b",".join(line.split()) + b"\n" for line in lines.splitlines())

@@ -22,7 +22,7 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 Without `recording` a file is one, without `follower_id` each pair is a driver of its own, without
 `frame` a pair's rows are in the order of their times.
 
-A file may call these otherwise and have other units: see `cfx.data.own_columns`.
+A file may call these otherwise (`data.columns`) and have other units (`data.units`).
 
 A length of 0 says that the leader's position is that of its rear bumper. See
 `cfx.data.tidy_checks.with_positions` for what follows from a column of gaps.
@@ -33,18 +33,20 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import pandas as pd
 import pyarrow as pa
 import pyarrow.csv
 import pyarrow.parquet as pq
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
+from pydantic_core import PydanticCustomError
 
-from cfx.core import scratch
+from cfx.core import memory
 from cfx.core.component import Settings
 from cfx.core.errors import OutputError, listed
 from cfx.core.files import atomic_write
@@ -60,10 +62,10 @@ from cfx.data.files import (
     partitions,
     recording_of,
 )
-from cfx.data.own_columns import OwnColumns, OwnUnits, own_layout, written_units
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.table import Column, Layout, Table, read_table, table_of
 from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, check_gap, time_steps
+from cfx.data.units import factor
 
 LABELS = ("recording", "pair_id", "leader_id", "follower_id")
 """Columns of names that every pair has."""
@@ -78,9 +80,14 @@ SIGNAL_COLUMNS = {
 }
 """A pair's signals, and the columns that they are written in."""
 
-TRUE_MODEL = "true_model"
-OPTIONAL_LABELS = ("driver_type", "leader_driver_type", "site", "vehicle")
-"""Columns of names that some files have, called as the attributes of pairs."""
+OPTIONAL_LABELS = {
+    "true_model": "truth_model",
+    "driver_type": "driver_type",
+    "leader_driver_type": "leader_driver_type",
+    "site": "site",
+    "vehicle": "vehicle",
+}
+"""Columns of names that some files have, and the attributes of pairs that they hold."""
 
 _NGSIM = "This looks like an NGSIM file: use data=ngsim."
 _REVERSING = "is negative; speeds count along the lane and must be 0 or more"
@@ -111,10 +118,7 @@ LAYOUT = Layout(
         ),
         Column(GAP, "m", needed=False),
         Column(LANE, needed=False, may_be_empty=True, whole=True, wrong="is no lane number"),
-        *[
-            Column(name, is_name=True, needed=False, may_be_empty=True)
-            for name in (TRUE_MODEL, *OPTIONAL_LABELS)
-        ],
+        *[Column(name, is_name=True, needed=False, may_be_empty=True) for name in OPTIONAL_LABELS],
         Column(f"{TRUE}.+", many=True, needed=False, may_be_empty=True),
     ),
     keys={"pair": "pair_id", "frame": "frame"},
@@ -122,6 +126,90 @@ LAYOUT = Layout(
     remedy="correct it or leave out the pair",
     parquet=True,
 )
+
+
+COLUMNS = {
+    "recording": "recording",
+    "pair_id": "pair_id",
+    "leader_id": "leader_id",
+    "follower_id": "follower_id",
+    "frame": "frame",
+    "time": "time_s",
+    "position": "follower_position_m",
+    "speed": "follower_speed_mps",
+    "acceleration": "follower_acceleration_mps2",
+    "leader_position": "leader_position_m",
+    "leader_speed": "leader_speed_mps",
+    "leader_acceleration": "leader_acceleration_mps2",
+    "leader_length": LENGTH,
+    "gap": GAP,
+    "lane": LANE,
+    "driver_type": "driver_type",
+    "leader_driver_type": "leader_driver_type",
+    "site": "site",
+    "vehicle": "vehicle",
+}
+"""The layout's columns by their names in settings; what says no `leader_` is the follower's."""
+
+_Name = Annotated[str, Field(min_length=1)] | None
+
+
+class OwnColumns(Settings):
+    """Settings: what a file calls its columns; a field for each column."""
+
+    recording: _Name = None
+    pair_id: _Name = None
+    leader_id: _Name = None
+    follower_id: _Name = None
+    frame: _Name = None
+    time: _Name = None
+    position: _Name = Field(None, description="the follower's, as the next two")
+    speed: _Name = None
+    acceleration: _Name = None
+    leader_position: _Name = None
+    leader_speed: _Name = None
+    leader_acceleration: _Name = None
+    leader_length: _Name = None
+    gap: _Name = Field(None, description="bumper to bumper")
+    lane: _Name = None
+    driver_type: _Name = None
+    leader_driver_type: _Name = None
+    site: _Name = None
+    vehicle: _Name = None
+
+
+def _of(si: str) -> AfterValidator:
+    """Returns a check that a unit can be turned into an SI unit."""
+
+    def check(unit: str | None) -> str | None:
+        try:
+            if unit is not None:
+                factor(unit, si)
+        except ValueError as error:
+            raise PydanticCustomError("unit", "{reason}", {"reason": str(error)}) from None
+        return unit
+
+    return AfterValidator(check)
+
+
+_Time = Annotated[str | None, _of("s")]
+_Length = Annotated[str | None, _of("m")]
+_Speed = Annotated[str | None, _of("m/s")]
+_Acceleration = Annotated[str | None, _of("m/s2")]
+
+
+class OwnUnits(Settings):
+    """Settings: the units of the columns that a file calls by names of its own."""
+
+    time: _Time = Field(None, description="null: s")
+    position: _Length = Field(None, description="of the follower; null: m")
+    speed: _Speed = Field(None, description="of the follower; null: m/s")
+    acceleration: _Acceleration = Field(None, description="of the follower; null: m/s2")
+    leader_position: _Length = Field(None, description="null: as position")
+    leader_speed: _Speed = Field(None, description="null: as speed")
+    leader_acceleration: _Acceleration = Field(None, description="null: as acceleration")
+    leader_length: _Length = Field(None, description="null: m")
+    gap: _Length = Field(None, description="null: m")
 
 
 class TidySettings(FileDatasetSettings):
@@ -144,8 +232,49 @@ class TidySettings(FileDatasetSettings):
         return self
 
     def own_layout(self) -> Layout:
-        """Returns the layout with the file's own names and units."""
-        return own_layout(LAYOUT, self.columns, self.units)
+        """Returns the layout with the file's own names and units.
+
+        Raises:
+            ValueError: one column would be two, or a unit is given for a column whose own name has
+                another.
+        """
+        by_name = {column.name: column for column in LAYOUT.columns}
+        for name, plain in COLUMNS.items():
+            by_name[plain] = self._own(name, by_name[plain])
+        settings = {plain: name for name, plain in COLUMNS.items()}
+        seen: dict[str, str] = {}
+        for column in by_name.values():
+            quantity = settings.get(column.name, column.name)
+            if column.title in seen:
+                raise ValueError(
+                    f"data.columns: the column {column.title} would be both {seen[column.title]}"
+                    f" and {quantity}; name another one"
+                )
+            seen[column.title] = quantity
+        gap = by_name[GAP].title
+        columns = [replace(one, unless=gap if one.unless else "") for one in by_name.values()]
+        return replace(LAYOUT, columns=tuple(columns))
+
+    def unit_of(self, name: str) -> str | None:
+        """Returns the unit that the file has for a quantity in place of the layout's; or None."""
+        if getattr(self.columns, name) is None:
+            return None
+        own: str | None = getattr(self.units, name, None)
+        return own or getattr(self.units, name.removeprefix("leader_"), None)
+
+    def _own(self, name: str, column: Column) -> Column:
+        """Returns a column with the name and the unit that the file has for it."""
+        called = getattr(self.columns, name)
+        if called is not None:
+            scale = factor(self.unit_of(name) or column.unit, column.unit) if column.unit else 1.0
+            return replace(column, called=called, factor=scale, needed=True, unless="")
+        unit = getattr(self.units, name, None)
+        if unit is not None and factor(unit, column.unit) != 1.0:
+            raise ValueError(
+                f"data.units.{name}={unit}: the column {column.name} is in {column.unit}, as its"
+                f" name says; name the file's column in data.columns.{name}"
+            )
+        return column
 
 
 class TidyDataset(Dataset):
@@ -193,7 +322,8 @@ class TidyDataset(Dataset):
         return joined(read_tidy(file, layout) for file in self._files())
 
     def units(self) -> Mapping[str, str]:
-        return written_units(self.settings.columns, self.settings.units)
+        units = {name: self.settings.unit_of(name) for name in OwnUnits.model_fields}
+        return {name: unit for name, unit in units.items() if unit}
 
 
 def read_tidy(path: Path, layout: Layout = LAYOUT) -> PairSet:
@@ -237,12 +367,7 @@ def _pairs(table: Table) -> PairSet:
 
 
 def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:
-    """Returns the pairs of a table that was checked.
-
-    Args:
-        order: see `cfx.data.tidy_checks.check`.
-        starts: see there.
-    """
+    """Returns the pairs of a table that was checked; as `check` orders them."""
     numbers = {name: values[order] for name, values in table.numbers.items()}
     steps = time_steps(numbers["time_s"], starts)
     ends = np.append(starts[1:], len(order))
@@ -256,25 +381,18 @@ def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:
         lane = None
         if LANE in numbers and not np.isnan(numbers[LANE][start]):
             lane = int(numbers[LANE][start])
-        signals: dict[str, Any] = {}
+        fields: dict[str, Any] = {name: label[name] for name in LABELS}
+        for name, attribute in OPTIONAL_LABELS.items():
+            fields[attribute] = label.get(name, "")
         for signal, column in SIGNAL_COLUMNS.items():
-            signals[signal] = numbers[column][start:end]
+            fields[signal] = numbers[column][start:end]
         pair = Pair(
-            pair_id=label["pair_id"],
-            recording=label["recording"],
-            leader_id=label["leader_id"],
-            follower_id=label["follower_id"],
+            **fields,
             first_frame=int(numbers["frame"][start]),
             dt=_simplest(step),
             leader_length=float(numbers[LENGTH][start]),
-            **signals,
             lane=lane,
             truth=truth,
-            truth_model=label.get(TRUE_MODEL, ""),
-            driver_type=label.get("driver_type", ""),
-            leader_driver_type=label.get("leader_driver_type", ""),
-            site=label.get("site", ""),
-            vehicle=label.get("vehicle", ""),
         )
         pairs.append(pair)
     return pairs
@@ -297,9 +415,6 @@ def _simplest(step: float) -> float:
             return float(simple)
     return step
 
-
-_ATTRIBUTES = {TRUE_MODEL: "truth_model"} | {name: name for name in OPTIONAL_LABELS}
-"""Optional columns of labels, and the attributes of pairs that they hold."""
 
 _PAIRS_AT_ONCE = 1024
 """Pairs that are in one table while they are written."""
@@ -360,23 +475,17 @@ def _tables(pairs: PairSet) -> Iterator[Any]:
     optional = []
     if any(pair.lane is not None for pair in pairs.pairs):
         optional.append(LANE)
-    for name, attribute in _ATTRIBUTES.items():
+    for name, attribute in OPTIONAL_LABELS.items():
         if any(getattr(pair, attribute) for pair in pairs.pairs):
             optional.append(name)
     truths = _truth_names(pairs)
     for start in range(0, max(1, len(pairs)), _PAIRS_AT_ONCE):
         yield _as_table(pairs[start : start + _PAIRS_AT_ONCE], optional, truths)
-        scratch.release()
+        memory.release()
 
 
 def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[str]) -> Any:
-    """Returns pairs as an Arrow table in the tidy layout.
-
-    Args:
-        pairs: the rows.
-        optional: columns of labels that only some files have.
-        truths: true parameters.
-    """
+    """Returns pairs as an Arrow table with some of the optional columns."""
     sizes = [len(pair) for pair in pairs]
     pair_of_row = pa.array(np.repeat(np.arange(len(sizes)), sizes))
 
@@ -398,7 +507,7 @@ def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[s
     columns[LENGTH] = per_pair([pair.leader_length for pair in pairs], pa.float64())
     if LANE in optional:
         columns[LANE] = per_pair([pair.lane for pair in pairs], pa.int64())
-    for name, attribute in _ATTRIBUTES.items():
+    for name, attribute in OPTIONAL_LABELS.items():
         if name in optional:
             columns[name] = per_pair([getattr(pair, attribute) for pair in pairs], pa.string())
     for name in truths:

@@ -82,11 +82,7 @@ def _with_names_and_frames(table: Table) -> Table:
 
 
 def _check_frames(table: Table) -> tuple[Ints, Ints]:
-    """Checks that frames are consecutive and the time step is constant.
-
-    Returns:
-        As `check`.
-    """
+    """Checks that frames are consecutive and the time step is constant; returns as `check`."""
     frame, pair = table.numbers["frame"], table.labels["pair_id"].codes
     order = np.lexsort((frame, pair))
     is_new = np.append(True, np.diff(pair[order]) != 0)

@@ -230,11 +230,7 @@ class _Facts:
 
 
 def _rows_of(tracks: Tracks, recording: Ints, vehicle: Ints, frame: Ints) -> tuple[Ints, Marks]:
-    """Returns where the rows of vehicles at frames are, `(M,)` each.
-
-    Returns:
-        The index of the row, 0 if there is none; and whether there is one.
-    """
+    """Returns the rows of vehicles at frames, `(M,)`: index, 0 if none; whether there is one."""
     if not len(tracks) or not len(vehicle):
         return np.zeros(len(vehicle), dtype=np.int64), np.zeros(len(vehicle), dtype=bool)
     first = int(min(tracks.frame.min(), frame.min()))
@@ -252,11 +248,7 @@ def _rows_of(tracks: Tracks, recording: Ints, vehicle: Ints, frame: Ints) -> tup
 
 
 def _ends(tracks: Tracks, facts: _Facts, last: Ints) -> dict[str, Marks]:
-    """Returns why each pair ends, by reason, `(P,)` each.
-
-    Args:
-        last: index of each pair's last row.
-    """
+    """Returns why each pair ends, by reason, `(P,)` each, from the index of its last row."""
     after = np.minimum(last + 1, len(tracks) - 1)
     goes_on = (
         (tracks.vehicle[after] == tracks.vehicle[last])

@@ -17,9 +17,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.core import scratch
+from cfx.core import memory
 from cfx.core.engine import Engine, Report
-from cfx.core.memory import give_back
 from cfx.core.threads import one_thread
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
@@ -322,7 +321,7 @@ def simulate_in_shards(
     with closing(engine.map(simulate_shard, shards, lambda _: None)) as results:
         for number, part in results:
             joined.put(number, part)
-    give_back()
+    memory.give_back()
     return joined.whole()
 
 
@@ -368,7 +367,7 @@ class _Joined:
             target[:, width:] = False if values.dtype == torch.bool else values[:, -1:]
         if part.beyond is not None:
             self._beyond[number] = part.beyond
-        scratch.release()
+        memory.release()
 
     def _empty(self, values: Tensor) -> Tensor:
         """Returns room for values `(pairs, columns, ...)` of all shards, on their device."""
@@ -376,7 +375,7 @@ class _Joined:
         if values.device.type != "cpu":
             return values.new_empty(shape)
         kind = values.new_empty(0).numpy().dtype
-        return torch.as_tensor(scratch.empty(shape, kind, together=_TENSORS))
+        return torch.as_tensor(memory.empty(shape, kind, together=_TENSORS))
 
     def whole(self) -> ClosedLoop:
         """Returns the closed loops of all shards, `(P, K + 1)`."""

@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx.core import registry, scratch
-from cfx.core.memory import give_back
+from cfx.core import memory, registry
+from cfx.core.errors import OWN
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import CLUSTERS, StyleResult
@@ -45,9 +45,9 @@ def parts_of(pairs: int) -> Iterator[slice]:
     """
     for start in range(0, pairs, PAIRS_AT_ONCE):
         yield slice(start, min(start + PAIRS_AT_ONCE, pairs))
-        scratch.release()
+        memory.release()
         if pairs > PAIRS_AT_ONCE:
-            give_back()
+            memory.give_back()
 
 
 def beside_recording(
@@ -106,7 +106,7 @@ class SimulatedPairs(Sequence[PairTrajectory]):
 
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
-            scratch.release()
+            memory.release()
             return tuple(self._pair(number) for number in range(*index.indices(len(self))))
         return self._pair(range(len(self))[index])
 
@@ -300,7 +300,7 @@ class _Measures:
                 values = _values(one, scopes)
             # A plugin may raise anything, and must not cost the job its results.
             except Exception as error:
-                if one.distribution == registry.OWN:
+                if one.distribution == OWN:
                     raise
                 reason = registry.in_words(error)
                 self._left_out.append(leave_out(one.name, one.distribution, reason))

@@ -18,7 +18,7 @@ import numpy as np
 import pandas as pd
 from pydantic import TypeAdapter, ValidationError
 
-from cfx.core.errors import DataError
+from cfx.core.errors import DataError, without_passwords
 from cfx.core.job_folder import (
     examine,
     optional,
@@ -27,7 +27,6 @@ from cfx.core.job_folder import (
     read_metrics,
     read_yaml,
     read_yaml_list,
-    without_password,
 )
 from cfx.data.style import StyleResult
 from cfx.evaluation.headline import improvement_key
@@ -380,7 +379,7 @@ def read_job(origin: Origin) -> Job:
         data=public(data),
         metrics=read_metrics(folder / "metrics.json"),
         tables=tables,
-        overrides=None if typed is None else tuple(without_password(str(one)) for one in typed),
+        overrides=None if typed is None else tuple(without_passwords(str(one)) for one in typed),
         experiment=str(config.get("preset") or ""),
         started=started,
         seconds=seconds,

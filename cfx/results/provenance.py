@@ -66,13 +66,14 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
         PluginError: there is no component of that name.
     """
     from cfx.core import registry
+    from cfx.core.errors import OWN
 
     found = {}
     for kind in registry.KINDS.values():
         node = values.get(kind.group)
         if isinstance(node, Mapping) and "name" in node:
             entry = registry.entry(kind.name, str(node["name"]))
-            if entry.distribution != registry.OWN:
+            if entry.distribution != OWN:
                 found[entry.distribution] = entry.version
     return found
 
@@ -83,11 +84,11 @@ def metric_distributions(values: Mapping[str, Any]) -> dict[str, str]:
     Raises:
         PluginError: there is no metric of that name.
     """
-    from cfx.core import registry
+    from cfx.core.errors import OWN
     from cfx.evaluation.metrics.base import entries_of
 
     entries = entries_of(values.get("metrics", "all"))
-    return {one.distribution: one.version for one in entries if one.distribution != registry.OWN}
+    return {one.distribution: one.version for one in entries if one.distribution != OWN}
 
 
 def process_tags() -> dict[str, str]:

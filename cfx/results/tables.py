@@ -26,8 +26,7 @@ from cfx.calibration.settings import (
     reliable,
 )
 from cfx.core.parameters import Parameter
-from cfx.data.site_styles import style_distances, styles_by_site
-from cfx.data.style import INDICATORS
+from cfx.data.style import INDICATORS, style_distances, styles_by_site
 from cfx.evaluation.result import METHODS
 from cfx.evaluation.sites import ALL, BASELINES
 from cfx.evaluation.tables import scope_label

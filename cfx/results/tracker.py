@@ -12,8 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from cfx.core import registry
-from cfx.core.errors import TrackingError
-from cfx.core.extras import install_line
+from cfx.core.errors import TrackingError, install_line
 from cfx.core.storage import is_url, local_folder
 from cfx.policies.ready import folder_of_ready_made, is_ready_made
 

@@ -27,7 +27,7 @@ from cfx.calibration.search import GradientSearch
 from cfx.calibration.shards import Solver
 from cfx.core import registry
 from cfx.data.pairs import SIGNALS, Pair, PairBatch, PairSet
-from cfx.data.resample import resampled
+from cfx.data.signals import resampled
 from cfx.models.base import DrivingModel, Leader
 from cfx.simulation.rollout import MemoryStepper, simulate
 from cfx.simulation.synthetic import SyntheticDataset

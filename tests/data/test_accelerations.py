@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from cfx.data.accelerations import (
+from cfx.data.files import Floats
+from cfx.data.pairs import PairSet
+from cfx.data.signals import (
     RECORDED,
     best_average,
     smoothed_twice,
     with_usable_accelerations,
 )
-from cfx.data.files import Floats
-from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, write_tidy
 from tests.drives import straight_pairs
 
@@ -80,11 +80,8 @@ def test_what_was_smoothed_is_said_and_can_be_refused(
     assert np.array_equal(recorded.follower_acceleration, pair.follower_acceleration)
 
 
-def test_real_recordings_are_told_apart(shared_data: Path) -> None:
-    reconstructed = TidyDataset(
-        path=shared_data / "i80_reconstructed_pairs.parquet", min_frames=2
-    ).read()
-    assert with_usable_accelerations(reconstructed, "smooth") is reconstructed
+def test_real_recordings_are_told_apart(shared_data: Path, i80_pairs: PairSet) -> None:
+    assert with_usable_accelerations(i80_pairs, "smooth") is i80_pairs
     ispra = TidyDataset(
         path=shared_data / "openacc_ispra_low_speed_pairs.parquet", min_frames=2
     ).read()

@@ -139,7 +139,7 @@ def test_what_is_possible_but_rare_is_asked_about_by_a_job_too(
     change(frame.copy()).to_csv(path, index=False)
     TidyDataset(path=path, min_frames=100).load()
     assert doubt in caplog.text
-    assert doubt in describe(path)
+    assert doubt in describe(path).text
 
 
 @pytest.mark.parametrize(

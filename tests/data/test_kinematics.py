@@ -138,7 +138,7 @@ def test_a_job_is_refused_warned_or_left_alone(
         dataset().load()
     for words in (str(path), "one of 4 pairs", f"'{PAIRS[2].pair_id}'", "km/h", "data.check"):
         assert words in str(error.value)
-    assert "km/h" in describe(path)
+    assert "km/h" in describe(path).text
     assert len(dataset(check="off").load()) == 4
     assert not caplog.records
     assert len(dataset(check="report").load()) == 4
@@ -177,10 +177,9 @@ def test_real_recordings_are_let_through(path: Path) -> None:
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
-@pytest.mark.parametrize("count", [4, 6, 8, 12])
-def test_a_few_pairs_of_a_real_recording_are_let_through(count: int) -> None:
+def test_a_few_pairs_of_a_real_recording_are_let_through() -> None:
     path = SHARED / "openacc_zalazone_pairs.parquet"
     pairs = TidyDataset(path=path, min_frames=900, check="off", accelerations="recorded").load()
-    for first in range(0, len(pairs) - count, count):
-        some = PairSet(pairs.pairs[first : first + count], "some")
-        assert typical_contradiction(some) is None
+    for count in (4, 6, 8, 12):
+        for first in range(0, len(pairs) - count, count):
+            assert typical_contradiction(PairSet(pairs[first : first + count], "some")) is None

@@ -12,9 +12,8 @@ import torch
 
 from cfx.app import cli
 from cfx.core.errors import ConfigError, DataError
-from cfx.data.own_columns import OwnColumns, OwnUnits, own_layout
 from cfx.data.pairs import PairSet
-from cfx.data.tidy import LAYOUT, TidyDataset, frame_of, pairs_from_frame
+from cfx.data.tidy import TidyDataset, TidySettings, frame_of, pairs_from_frame
 from cfx.models.krauss import Krauss
 from tests.drives import wavy_pairs
 
@@ -90,7 +89,7 @@ def test_a_time_that_stands_twice_is_refused_without_frames(tmp_path: Path) -> N
 
 
 def test_a_table_is_read_as_a_file(tmp_path: Path) -> None:
-    layout = own_layout(LAYOUT, OwnColumns(**COLUMNS), OwnUnits(**UNITS))
+    layout = TidySettings(path="own.csv", columns=COLUMNS, units=UNITS).own_layout()
     found = pairs_from_frame(table(), layout=layout)
     from_file = TidyDataset(path=written(tmp_path), columns=COLUMNS, units=UNITS).read()
     for one, other in zip(found, from_file, strict=True):

@@ -98,7 +98,7 @@ def test_an_unknown_recording_and_an_empty_folder_are_said(folder: Path, tmp_pat
 
 
 def test_describe_says_what_each_file_holds(folder: Path) -> None:
-    text = describe(folder)
+    text = describe(folder).text
     assert "3 files, read one after the other" in text
     assert "us 101" in text
     (last,) = [line.split() for line in text.splitlines() if line.startswith("  all ")]

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
-from cfx.data.resample import resampled
+from cfx.data.signals import resampled
 from cfx.data.tidy import TidyDataset, write_tidy
 
 

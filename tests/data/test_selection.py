@@ -102,10 +102,10 @@ def test_every_pair_is_kept_or_counted() -> None:
         ),
         (
             {"min_frames": 2, "recording": "othr"},
-            "no such recording. Did you mean 'other'? Known: r, other.",
+            "there is no recording 'othr'. Did you mean 'other'? Known: r, other.",
         ),
-        ({"min_frames": 2, "lanes": [9]}, "pairs in lanes 2, 3 only"),
-        ({"min_frames": 2, "lanes": []}, "pairs in lanes 2, 3 only"),
+        ({"min_frames": 2, "lanes": [9]}, "there is no lane '9'. Known: 2, 3."),
+        ({"min_frames": 2, "lanes": []}, "the list is empty. Known: 2, 3."),
         (
             {"min_frames": 2, "pair_ids": ["bb"]},
             "there is no pair 'bb'. Did you mean 'b'? Known: a, b, c, d.",

@@ -10,8 +10,14 @@ import pytest
 
 from cfx.app import cli
 from cfx.data.pairs import Pair, PairSet
-from cfx.data.site_styles import groups, style_distances, styles_by_site
-from cfx.data.style import StyleResult, StyleSettings, measure_style
+from cfx.data.style import (
+    StyleResult,
+    StyleSettings,
+    groups,
+    measure_style,
+    style_distances,
+    styles_by_site,
+)
 from cfx.data.tidy import write_tidy
 from tests.data.test_style import a_pair
 

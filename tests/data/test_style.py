@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,7 +24,6 @@ from cfx.data.style import (
     normalise,
     select_cluster,
 )
-from cfx.data.tidy import TidyDataset
 
 # Whole numbers keep columns either constant or clearly spread: rounding itself is tested apart.
 MATRICES = st.integers(1, 20).flatmap(
@@ -272,9 +270,8 @@ def test_refuses_settings_that_make_no_sense(options: dict[str, object]) -> None
 
 
 @pytest.mark.parametrize("direction", ["signed", "printed"])
-def test_real_drivers(shared_data: Path, direction: str) -> None:
-    pairs = TidyDataset(path=shared_data / "i80_reconstructed_pairs.parquet", min_frames=2).load()
-    style = measure_style(pairs, StyleSettings(direction=direction))
+def test_real_drivers(i80_pairs: PairSet, direction: str) -> None:
+    style = measure_style(i80_pairs, StyleSettings(direction=direction))
     table = style.table
     assert len(table) == 221
     assert [int((table["cluster"] == k).sum()) for k in range(3)] == [55, 111, 55]

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import functools
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -18,7 +21,12 @@ from cfx.simulation.trajectory import Start, Trajectory
 MODELS: dict[str, type[DrivingModel]] = {"krauss": Krauss, "w99": W99}
 
 
-def made(**options: object) -> PairSet:
+DIVERSE = {"seed": 5, "pairs": 12, "platoon_size": 4, "frames": 400}
+DIVERSE |= {"heterogeneity": 1.0, "variation": 1.0}
+
+
+@functools.cache
+def made(**options: Any) -> PairSet:
     return SyntheticDataset(**{"pairs": 6, "platoon_size": 3, "frames": 201, **options}).load()
 
 
@@ -47,7 +55,7 @@ def driven_again(pair: Pair) -> Trajectory:
 @pytest.mark.parametrize("model", MODELS)
 @pytest.mark.parametrize("dt", [0.1, 0.2])
 def test_true_parameters_give_the_recorded_drive_again(model: str, dt: float) -> None:
-    for pair in made(model=model, dt=dt):
+    for pair in made(model=model, **({} if dt == 0.1 else {"dt": dt})):
         again = driven_again(pair)
         np.testing.assert_allclose(
             again.position.numpy(), pair.follower_position, rtol=0, atol=1e-9
@@ -77,12 +85,11 @@ def test_each_follower_leads_the_next() -> None:
 
 
 @pytest.mark.parametrize("model", MODELS)
-@pytest.mark.parametrize("seed", range(3))
-def test_traffic_is_plausible(model: str, seed: int) -> None:
-    pairs = made(model=model, seed=seed, pairs=12, platoon_size=4, frames=600)
+def test_traffic_is_plausible(model: str) -> None:
+    pairs = made(model=model, pairs=36, platoon_size=4, frames=600)
     speed = np.concatenate([pair.follower_speed for pair in pairs])
     acceleration = np.concatenate([pair.follower_acceleration for pair in pairs])
-    assert len(pairs) == 12
+    assert len(pairs) == 36
     assert speed.min() >= 0
     assert speed.max() < 25
     assert np.abs(acceleration).max() < 5
@@ -94,9 +101,7 @@ def test_traffic_is_plausible(model: str, seed: int) -> None:
 
 @pytest.mark.parametrize("model", MODELS)
 def test_the_most_diverse_drivers_do_not_collide(model: str) -> None:
-    pairs = made(
-        model=model, seed=5, pairs=12, platoon_size=4, frames=400, heterogeneity=1.0, variation=1.0
-    )
+    pairs = made(model=model, **DIVERSE)
     assert min(pair.gap.min() for pair in pairs) > 0
     assert max(np.abs(pair.follower_acceleration).max() for pair in pairs) < 9 + 1e-6
 
@@ -122,31 +127,31 @@ def test_smooth_noise_is_standard_and_smooth() -> None:
 @pytest.mark.parametrize("model", MODELS)
 def test_true_parameters_vary_as_asked_and_stay_in_bounds(model: str) -> None:
     space = MODELS[model]().space
-    for pair in made(model=model, variation=1.0, heterogeneity=1.0, frames=300):
+    for pair in made(model=model, **DIVERSE):
         assert tuple(pair.truth) == space.names
         for name, values in pair.truth.items():
-            assert values.shape == (300,)
+            assert values.shape == (400,)
             assert values.min() >= space[name].low
             assert values.max() <= space[name].high
-            assert (np.diff(values).reshape(-1)[np.arange(299) % 5 != 4] == 0).all(), (
+            assert (np.diff(values).reshape(-1)[np.arange(399) % 5 != 4] == 0).all(), (
                 "held for half a second"
             )
             assert values.std() > 0
-    for pair in made(model=model, variation=0.0):
-        assert all(np.ptp(values) == 0 for values in pair.truth.values())
-    alike = made(model=model, variation=0.0, heterogeneity=0.0)
-    for pair in alike:
+    for pair in made(model=model, variation=0.0, heterogeneity=0.0, frames=20, min_frames=2):
         for name, values in pair.truth.items():
-            assert values[0] == pytest.approx(space[name].default)
+            assert values == pytest.approx(space[name].default)
+            assert np.ptp(values) == 0
 
 
 def test_the_seed_decides() -> None:
-    assert made(seed=0).fingerprint == made(seed=0).fingerprint
-    assert made(seed=0).fingerprint != made(seed=1).fingerprint
+    first, again, other = (
+        SyntheticDataset(pairs=3, frames=60, seed=seed, min_frames=2).load() for seed in (0, 0, 1)
+    )
+    assert first.fingerprint == again.fingerprint != other.fingerprint
 
 
 def test_noise_belongs_to_the_vehicle_and_leaves_the_truth_alone() -> None:
-    clean, noisy = made(frames=600), made(frames=600, noise_position_m=0.2, noise_speed_mps=0.1)
+    clean, noisy = made(frames=300), made(frames=300, noise_position_m=0.2, noise_speed_mps=0.1)
     for one, other in zip(clean, noisy, strict=True):
         assert (other.follower_position - one.follower_position).std() == pytest.approx(
             0.2, rel=0.15

@@ -115,11 +115,10 @@ def test_a_table_reads_as_a_file_does(good: pd.DataFrame, tmp_path: Path) -> Non
     same(pairs_from_frame(good), read(good, tmp_path, "t.parquet"))
 
 
-def test_real_pairs(shared_data: Path) -> None:
+def test_real_pairs(shared_data: Path, i80_pairs: PairSet) -> None:
     path = shared_data / "i80_reconstructed_pairs.parquet"
-    assert len(TidyDataset(path=path, min_frames=2).load()) == 229
+    assert len(i80_pairs) == 229
     assert len(TidyDataset(path=path).load()) == 71
-    assert len(TidyDataset(path=path, recording="i80-0400").load()) == 26
     with pytest.raises(
         DataError,
         match="asked for 50 pairs but only 26 have at least 700 frames in the selected recording",
@@ -132,9 +131,9 @@ def test_real_pairs(shared_data: Path) -> None:
 
 @pytest.mark.parametrize("name", ["t.parquet", "t.csv", "t.csv.gz"])
 def test_writing_and_reading_real_pairs_changes_nothing(
-    shared_data: Path, tmp_path: Path, name: str
+    i80_pairs: PairSet, tmp_path: Path, name: str
 ) -> None:
-    pairs = TidyDataset(path=shared_data / "i80_reconstructed_pairs.parquet", max_pairs=5).load()
+    pairs = i80_pairs.take(range(5))
     write_tidy(pairs, tmp_path / name)
     same(pairs, read_tidy(tmp_path / name))
     assert [path.name for path in tmp_path.iterdir()] == [name], "no temporary file is left"

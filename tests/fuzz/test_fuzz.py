@@ -134,7 +134,7 @@ def examined(path: Path) -> None:
         except CfxError as error:
             said(error)
     try:
-        assert describe(path)
+        assert describe(path).text
     except CfxError as error:
         said(error)
 

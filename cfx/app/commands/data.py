@@ -56,10 +56,9 @@ def _describe(options: argparse.Namespace) -> None:
     import pandas as pd
 
     from cfx.data.base import joined
-    from cfx.data.describe import describe_sites, describe_style, described
-    from cfx.data.site_styles import style_distances
+    from cfx.data.describe import describe, describe_sites, describe_style
     from cfx.data.sites import with_sites, with_vehicles
-    from cfx.data.style import StyleSettings, measure_style
+    from cfx.data.style import StyleSettings, measure_style, style_distances
 
     overrides = [word for word in options.files if _is_setting(word)]
     files = [word for word in options.files if not _is_setting(word)]
@@ -73,7 +72,7 @@ def _describe(options: argparse.Namespace) -> None:
     words = "".join(f" {shlex.quote(word)}" for word in own)
     read = []
     for file in files:
-        description = described(Path(file), settings, words)
+        description = describe(Path(file), settings, words)
         print(description.text, end="\n\n" if len(files) > 1 else "\n")
         if description.pairs is not None and len(description.pairs):
             read.append(description.pairs)

@@ -24,13 +24,13 @@ from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.core import registry
 from cfx.core.engine import Engine
-from cfx.core.errors import ConfigError, PluginError
+from cfx.core.errors import OWN, ConfigError, PluginError
 from cfx.core.memory import require_memory
 from cfx.core.storage import is_url
 from cfx.core.threads import limit_cores, set_threads
 from cfx.data.base import Dataset
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.resample import COARSE_S
+from cfx.data.signals import COARSE_S
 from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.base import MetricSet
@@ -299,7 +299,7 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
     )
     reported = {}
     for entry in registry.entries("objective"):  # cfx's own and the chosen one
-        if entry.distribution == registry.OWN:
+        if entry.distribution == OWN:
             made = registry.create("objective", {"name": entry.name})
             reported[entry.name] = cast(Objective, made)
     reported[config.objective["name"]] = parts.objective

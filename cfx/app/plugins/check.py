@@ -12,7 +12,7 @@ from cfx.app import nodes
 from cfx.core import registry
 from cfx.core.component import API_VERSION
 from cfx.core.console import blank_table, console_logging, put
-from cfx.core.errors import CfxError, ConfigError, NotInstalledError
+from cfx.core.errors import OWN, CfxError, ConfigError, NotInstalledError
 from cfx.core.progress import Task
 
 
@@ -123,7 +123,7 @@ def examine(entry: registry.Entry) -> Verdict:
         complaint = f"{entry} cannot be used with its default settings: {registry.in_words(error)}"
     if complaint:
         return Verdict(entry, "broken", complaint)
-    if entry.distribution == registry.OWN or entry.api:
+    if entry.distribution == OWN or entry.api:
         return Verdict(entry, "fine")
     hint = (
         f"{entry.distribution} declares no version of cfx's plugin API and counts as built for the"
@@ -138,7 +138,7 @@ def _shadow(entry: registry.Entry) -> str:
     rivals = registry.rivals(entry)
     if not rivals:
         return ""
-    if rivals[0].distribution == registry.OWN:
+    if rivals[0].distribution == OWN:
         return (
             f"{entry} is never used, because cfx has a {entry.kind} '{entry.name}' of its own;"
             f" its author must rename it, or pip uninstall {entry.distribution}"

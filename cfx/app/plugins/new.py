@@ -16,7 +16,7 @@ from typing import Any
 
 from cfx.core import registry
 from cfx.core.component import API_VERSION
-from cfx.core.errors import ConfigError, OutputError, PluginError
+from cfx.core.errors import OWN, ConfigError, OutputError, PluginError
 
 _TEMPLATE = Path(__file__).parent / "template"
 
@@ -90,9 +90,9 @@ def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
 
     try:
         major, minor = Version(cfx.__version__).release[:2]
-        requires = f"{registry.OWN}>={major}.{minor},<{major + 1}"  # the plugin API decides too
+        requires = f"{OWN}>={major}.{minor},<{major + 1}"  # the plugin API decides too
     except (InvalidVersion, ValueError):  # a checkout that nobody installed
-        requires = registry.OWN
+        requires = OWN
     class_name = "".join(part.capitalize() for part in name.split("_"))
     return {
         "kind": kind.name,

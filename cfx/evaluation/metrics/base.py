@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import PluginError
+from cfx.core.errors import OWN, PluginError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -264,7 +264,7 @@ class MetricSet:
             try:
                 found.append(_made(entry))
             except PluginError as error:
-                if chosen != "all" or entry.distribution == registry.OWN:
+                if chosen != "all" or entry.distribution == OWN:
                     raise
                 left_out.append(leave_out(entry.name, entry.distribution, str(error)))
         return cls(_ordered(found), tuple(left_out))
@@ -273,7 +273,7 @@ class MetricSet:
     def own(cls) -> MetricSet:
         """Makes cfx's own metrics."""
         entries = registry.entries("metric")
-        return cls(_ordered([_made(one) for one in entries if one.distribution == registry.OWN]))
+        return cls(_ordered([_made(one) for one in entries if one.distribution == OWN]))
 
 
 def entries_of(chosen: Literal["all"] | Sequence[str] = "all") -> tuple[registry.Entry, ...]:

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cfx.core import scratch
+from cfx.core import memory
 from cfx.core.parameters import squashed
 from cfx.data.pairs import SIGNALS, PairBatch
 from cfx.learners.base import TrainingData
@@ -503,11 +503,11 @@ def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
     for name in SIGNALS:
         signal = getattr(batch, name)
         shape = (len(pair), signal.shape[1])
-        values = torch.as_tensor(scratch.empty(shape, np.float32, together=len(SIGNALS)))
+        values = torch.as_tensor(memory.empty(shape, np.float32, together=len(SIGNALS)))
         values = values.to(signal.device)
         for part in _parts(len(pair)):
             values[part] = signal[pair[part]].float()
-            scratch.release()
+            memory.release()
         changed[name] = values
     return PairBatch(
         **changed,
@@ -537,10 +537,10 @@ def _measured_tokens(
         history = measured_history(batch, pairs, windows, training_data.windows.length)
         own = tokens(history, policy.inputs, policy.summary)
         if part.start == 0:
-            room = scratch.empty((len(batch), *own.shape[1:]), np.float32)
+            room = memory.empty((len(batch), *own.shape[1:]), np.float32)
             found = torch.as_tensor(room).to(device)
         found[part] = own
-        scratch.release()
+        memory.release()
     return found
 
 
@@ -575,7 +575,7 @@ def _scaler(
             own = pair[number, part]
             center = squashed(base[number, part])[:, None].expand(-1, windows, -1)
             yield torch.cat([seen[own], center], -1)[None], counted[number, part][None]
-            scratch.release()
+            memory.release()
 
     def of_driver(number: int) -> _Values:
         for part in _parts(pair.shape[1]):

@@ -5,8 +5,6 @@ from __future__ import annotations
 import io
 import json
 import pickle
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,6 +15,7 @@ import pytest
 from scipy.io import savemat
 
 import cfx
+from cfx.app.cli import main
 from cfx.contracts import check_contract
 from cfx.core.errors import DataError
 from cfx_recordings.followernet import FollowernetDataset
@@ -167,16 +166,10 @@ def test_gives_gaps_and_speeds_back(name: str, tmp_path: Path) -> None:
         assert pair.dt == 0.1
 
 
-def described(*paths: Path) -> str:
-    """Returns what `cfx data describe` says of files."""
-    command = [sys.executable, "-m", "cfx", "data", "describe", *map(str, paths)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
-
-
-def test_each_is_recognised(tmp_path: Path) -> None:
-    text = described(*[write(tmp_path, made_pairs()) for _, write in READERS.values()])
+def test_each_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = [write(tmp_path, made_pairs()) for _, write in READERS.values()]
+    assert main(["data", "describe", *map(str, files)]) == 0
+    text = capsys.readouterr().out
     for name in READERS:
         assert f"data={name}" in text
     assert text.count("3 of 3 drivers") == len(READERS)

@@ -10,12 +10,8 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from cfx.core.errors import DataError
-from cfx.core.job_folder import (
-    optional,
-    read_json,
-    without_password,
-)
+from cfx.core.errors import DataError, without_passwords
+from cfx.core.job_folder import optional, read_json
 from cfx.core.storage import is_url, local_folder
 from cfx.figures.job import Job, read_job
 from cfx.results.tracker import Origin, tracking_of_run
@@ -122,7 +118,7 @@ def _one(folder: Path, place: str) -> Job | Unfinished:
         return read_job(Origin(place, folder))
     status = optional(folder / "outcome.json", read_json) or {}
     if status.get("code"):
-        return Unfinished(place, f"failed: {without_password(str(status.get('message', '')))}")
+        return Unfinished(place, f"failed: {without_passwords(str(status.get('message', '')))}")
     return Unfinished(place, "not finished: it has no metrics.json")
 
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 import importlib.metadata
 import re
 
-from cfx.core.errors import NotInstalledError, SumoError
-from cfx.core.extras import install_line
+from cfx.core.errors import NotInstalledError, SumoError, install_line
 
 DISTRIBUTION = "cfx-sumo"
 """What brings SUMO."""

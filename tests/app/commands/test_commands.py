@@ -11,9 +11,10 @@ import pytest
 
 from cfx.app import cli
 from cfx.core import registry
+from cfx.core.errors import OWN
 from tests.conftest import Installer
 
-OWN = [one.name for one in registry.entries("command") if one.distribution == registry.OWN]
+OWN = [one.name for one in registry.entries("command") if one.distribution == OWN]
 
 CENSUS = """
     import argparse

@@ -15,7 +15,7 @@ from cfx import FrameValues, Objective
 from cfx.calibration.objectives import GapRmse, Mixed, SpeedHuber, SpeedRmse, TheilU
 from cfx.contracts import check_contract
 from cfx.core import registry
-from cfx.core.errors import ConfigError
+from cfx.core.errors import OWN, ConfigError
 
 SHIPPED = {
     "speed_rmse": SpeedRmse(),
@@ -35,7 +35,7 @@ def test_contract(name: str) -> None:
 
 def test_every_registered_objective_of_cfx_is_tested_here() -> None:
     tested = {type(objective) for objective in SHIPPED.values()}
-    own = [one for one in registry.entries("objective") if one.distribution == registry.OWN]
+    own = [one for one in registry.entries("objective") if one.distribution == OWN]
     assert {registry.get("objective", one.name) for one in own} == tested
 
 

@@ -12,6 +12,7 @@ import pytest
 from matplotlib import pyplot as plt
 
 from cfx.core import registry
+from cfx.core.errors import OWN
 from cfx.figures.canvas import canvas, hover
 from cfx.figures.figure import JobFigure, Results, draw, write_figure, write_figures
 from cfx_report.inline import PLACE, inline_svg
@@ -85,7 +86,7 @@ def everything() -> Results:
 OWN = [
     one
     for one in registry.installed("figure")
-    if one.distribution in {registry.OWN, "cfx-report", "cfx-forecasts"}
+    if one.distribution in {OWN, "cfx-report", "cfx-forecasts"}
 ]
 
 

@@ -10,7 +10,7 @@ from matplotlib.text import Text
 
 from cfx.app import cli
 from cfx.core import registry
-from cfx.core.errors import ConfigError
+from cfx.core.errors import OWN, ConfigError
 from cfx.figures.canvas import Paper, canvas, on_paper, points, side_by_side, wrapped
 from cfx.figures.figure import Results, draw, figure_named
 from tests.made_up import make_results
@@ -28,7 +28,7 @@ def results() -> Results:
 def test_no_text_of_any_figure_is_larger_than_the_paper_asks_for(results: Results) -> None:
     drawn = 0
     for one in registry.installed("figure"):
-        if one.distribution not in {registry.OWN, "cfx-report", "cfx-forecasts"}:
+        if one.distribution not in {OWN, "cfx-report", "cfx-forecasts"}:
             continue  # a third party's chooses sizes of its own
         with on_paper(COLUMN):
             figure = draw(one, results)

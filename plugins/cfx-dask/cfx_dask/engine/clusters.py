@@ -12,8 +12,7 @@ import uuid
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cfx.core.errors import EngineError, NotInstalledError
-from cfx.core.extras import install_line
+from cfx.core.errors import EngineError, NotInstalledError, install_line
 from cfx.core.threads import cores
 from cfx_dask.engine.settings import DaskSettings
 

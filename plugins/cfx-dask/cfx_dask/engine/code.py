@@ -8,7 +8,8 @@ import importlib.util
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from cfx.core.registry import KINDS, OWN, entries
+from cfx.core.errors import OWN
+from cfx.core.registry import KINDS, entries
 
 
 @functools.cache

@@ -10,8 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.data.site_styles import ALL, Group, groups
-from cfx.data.style import INDICATORS, StyleResult, name_of_indicator
+from cfx.data.style import ALL, INDICATORS, Group, StyleResult, groups, name_of_indicator
 from cfx.figures.canvas import Array, canvas, hover, most_across, points, styled
 from cfx.figures.figure import JobFigure, Results
 from cfx.figures.text import INK, JOB_COLOURS
@@ -32,7 +31,7 @@ def draw_site_styles(style: StyleResult, distances: pd.DataFrame | None) -> Figu
 
     Args:
         style: of the drivers of at least two sites.
-        distances: as `cfx.data.site_styles.style_distances`.
+        distances: as `cfx.data.style.style_distances`.
     """
     shown = groups(style.table)
     across = most_across(_ACROSS)

@@ -7,9 +7,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cfx.core.registry import OWN, installed
-from cfx.data.site_styles import ALL
-from cfx.data.style import name_of_indicator
+from cfx.core.errors import OWN
+from cfx.core.registry import installed
+from cfx.data.style import ALL, name_of_indicator
 from cfx.evaluation.result import Purpose
 from cfx.figures.job import Job
 from cfx.figures.text import percent, plural, short_label

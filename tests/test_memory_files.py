@@ -15,12 +15,12 @@ import pytest
 import torch
 
 import cfx
-from cfx.core import scratch
+from cfx.core import memory
 from cfx.core.errors import OutputError
 from cfx.data import style, tidy
-from cfx.data.base import joined, scaled
+from cfx.data.base import joined
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.resample import resampled
+from cfx.data.signals import resampled, scaled
 from cfx.data.tidy import read_tidy, write_tidy
 from cfx.evaluation import closed_loop, evaluate, result
 from cfx.simulation.synthetic import SyntheticDataset
@@ -36,18 +36,18 @@ JOB = (
 
 def maps() -> int:
     gc.collect()
-    return len(scratch._maps)
+    return len(memory._maps)
 
 
 def test_small_arrays_lie_in_memory_and_large_ones_in_a_file_that_goes_with_them(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     before = maps()
-    monkeypatch.setattr(scratch, "LARGE", 1000)
-    small = scratch.empty((100,))
+    monkeypatch.setattr(memory, "LARGE", 1000)
+    small = memory.empty((100,))
     assert maps() == before
-    several = scratch.empty((100,), together=2)
-    large = scratch.empty((4, 100), np.float32)
+    several = memory.empty((100,), together=2)
+    large = memory.empty((4, 100), np.float32)
     assert maps() == before + 2
     assert (small.shape, several.shape, large.shape) == ((100,), (100,), (4, 100))
     assert large.dtype == np.float32
@@ -56,11 +56,11 @@ def test_small_arrays_lie_in_memory_and_large_ones_in_a_file_that_goes_with_them
 
 
 def test_what_is_released_is_read_again_and_counts_no_more() -> None:
-    array = scratch.in_file((1 << 22,))
+    array = memory.in_file((1 << 22,))
     array[:] = np.arange(len(array))
     process = psutil.Process()
     full = process.memory_info().rss
-    scratch.release()
+    memory.release()
     assert process.memory_info().rss < full - array.nbytes // 2
     assert array[12345] == 12345
     assert array.sum() == len(array) * (len(array) - 1) / 2
@@ -70,9 +70,9 @@ def test_a_full_disk_is_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     def full(_file: int, _size: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(scratch, "_reserve", full)
+    monkeypatch.setattr(memory, "_reserve", full)
     with pytest.raises(OutputError, match=r"has no room for 80 bytes .* set TMPDIR"):
-        scratch.in_file((10,))
+        memory.in_file((10,))
 
 
 def pairs_of_drivers() -> PairSet:
@@ -95,7 +95,7 @@ def test_pairs_of_several_files_that_are_too_many_lie_in_files(
     first, second = pairs_of_drivers(), SyntheticDataset(pairs=6, frames=80, seed=1).read()
     renamed = [replace(pair, pair_id=f"b{pair.pair_id}") for pair in second]
     parts = [first, PairSet(tuple(renamed), "second")]
-    monkeypatch.setattr(scratch, "LARGE", first.size + 1)
+    monkeypatch.setattr(memory, "LARGE", first.size + 1)
     before = maps()
     together = joined(iter(parts))
     assert maps() == before + 2
@@ -107,7 +107,7 @@ def test_pairs_of_several_files_that_are_too_many_lie_in_files(
 def test_changed_pairs_lie_in_files_too(monkeypatch: pytest.MonkeyPatch) -> None:
     pairs = pairs_of_drivers()
     expected = scaled(pairs, 2.0), resampled(pairs, 0.2)
-    monkeypatch.setattr(scratch, "LARGE", 1)
+    monkeypatch.setattr(memory, "LARGE", 1)
     before = maps()
     found = scaled(pairs, 2.0), resampled(pairs, 0.2)
     assert maps() == before + 2
@@ -121,7 +121,7 @@ def test_a_batch_in_files_is_the_same_batch(
 ) -> None:
     pairs = pairs_of_drivers()
     expected = PairBatch.of(pairs, dtype=dtype)
-    monkeypatch.setattr(scratch, "LARGE", 1)
+    monkeypatch.setattr(memory, "LARGE", 1)
     found = PairBatch.of(pairs, dtype=dtype)
     for name in ("leader_position", "follower_speed", "mask", "lengths"):
         assert torch.equal(getattr(found, name), getattr(expected, name))
@@ -153,7 +153,7 @@ def test_a_job_in_files_and_in_parts_has_the_same_results(
     monkeypatch.chdir(tmp_path)
     overrides = (*JOB, "data.max_pairs=6", "data.frames=200", f"protocol={protocol}")
     expected = cfx.run([*overrides, "hydra.run.dir=whole"])
-    monkeypatch.setattr(scratch, "LARGE", 1)
+    monkeypatch.setattr(memory, "LARGE", 1)
     for module in (closed_loop, evaluate):
         monkeypatch.setattr(module, "PAIRS_AT_ONCE", 4)
     for module, name in ((result, "_PAIRS_AT_ONCE"), (style, "_PAIRS_AT_ONCE")):
