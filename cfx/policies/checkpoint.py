@@ -64,8 +64,7 @@ def load(folder: Path | str) -> Agent:
     """
     folder = Path(folder)
     examine(folder)
-    written, weights = _read(folder)
-    description = _validated(folder, written)
+    description, weights = _read(folder)
     try:
         policy = registry.create("policy", description.policy)
         model = registry.create("model", description.model)
@@ -130,17 +129,6 @@ class _Description(BaseModel):
             expected_error=trained_on.expected_error,
             recorded=dict(trained_on.quantiles),
         )
-
-
-def _validated(folder: Path, written: Mapping[str, Any]) -> _Description:
-    try:
-        return _Description.model_validate(written)
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise DataError(
-            f"{folder}/{_DESCRIPTION}: {key}: {first['msg']}; give a folder that a job has written"
-        ) from None
 
 
 def _agent(
@@ -228,20 +216,27 @@ def _named(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
 
 
-def _read(folder: Path) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def _read(folder: Path) -> tuple[_Description, dict[str, Tensor]]:
     try:
         text = (folder / _DESCRIPTION).read_text(encoding="utf-8")
-        description = parse_json(text)
-        if not isinstance(description, dict):
+        written = parse_json(text)
+        if not isinstance(written, dict):
             raise ValueError(f"{_DESCRIPTION} is no JSON object")
         weights = safetensors.torch.load((folder / _TENSORS).read_bytes())
     except (OSError, ValueError, RuntimeError, SafetensorError) as error:
         raise DataError(
             f"{folder} holds no policy that can be read ({error}); give a job's folder"
         ) from error
-    if description.get("format") != _FORMAT:
+    if written.get("format") != _FORMAT:
         raise DataError(
-            f"{folder}/{_DESCRIPTION} has format {description.get('format')}; this version of cfx"
-            f" reads format {_FORMAT}"
+            f"{folder}/{_DESCRIPTION} has format {written.get('format')}; this version of cfx reads"
+            f" format {_FORMAT}"
         )
-    return description, weights
+    try:
+        return _Description.model_validate(written), weights
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise DataError(
+            f"{folder}/{_DESCRIPTION}: {key}: {first['msg']}; give a folder that a job has written"
+        ) from None

@@ -260,20 +260,17 @@ class RolloutDataset:
             shape: of each network's.
             generator: on the CPU; it goes on as if they were for all networks.
         """
-        return self._of_these(torch.rand((self._total, *shape), generator=generator))
+        return self._drawn(torch.rand, shape, generator)
 
     def normal(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
         """As `uniform`, from the standard normal distribution."""
-        return self._of_these(torch.randn((self._total, *shape), generator=generator))
+        return self._drawn(torch.randn, shape, generator)
 
-    @property
-    def _total(self) -> int:
-        return len(self.pair) if self.part is None else self.part.total
-
-    def _of_these(self, values: Tensor) -> Tensor:
-        if self.part is not None:
-            values = values[self.part.networks]
-        return values.to(self.pair.device)
+    def _drawn(
+        self, draw: Callable[..., Tensor], shape: tuple[int, ...], generator: torch.Generator
+    ) -> Tensor:
+        networks, total = self.part or Part(slice(None), len(self.pair))
+        return draw((total, *shape), generator=generator)[networks].to(self.pair.device)
 
     def for_base(self, base: Tensor) -> RolloutDataset:
         """Returns the same drivers with one base of another model, `(n,)` in its unit space."""
