@@ -51,7 +51,7 @@ class CalibrationSettings(Settings):
         "none",
         description="intervals of each driver's parameters beside the point estimate. laplace: each"
         " driver alone; nuts: the same by chains; sbi: the same by a network that learns from"
-        " simulations, of simulator=sumo too; hierarchical: with a prior that all drivers of the"
+        " simulations; hierarchical: with a prior that all drivers of the"
         " job give; none: the point estimate alone",
     )
     noise_step_s: float = Field(

@@ -89,13 +89,14 @@ def test_without_sbi_it_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.slow
-def test_sumo_in_the_loop(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("way", ["laplace", "sbi"])
+def test_sumo_in_the_loop(way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The posterior of a model that SUMO drives is that of its equations."""
     pytest.importorskip("libsumo", reason="SUMO is not here; pip install 'cfx-driving[sumo]'")
     monkeypatch.chdir(tmp_path)
     for setting, value in {"FIRST": 100, "ROUNDS": 1, "EPOCHS": 1, "SIMULATIONS": 1}.items():
         monkeypatch.setattr(neural, setting, value)
-    asked = [*QUICK, "model=krauss_sumo", "data.pairs=2", "calibration.posterior=sbi"]
+    asked = [*QUICK, "model=krauss_sumo", "data.pairs=1", f"calibration.posterior={way}"]
     found = {}
     for simulator in ("sumo", "memory"):
         cfx.run([*asked, f"simulator={simulator}", f"hydra.run.dir={simulator}"])

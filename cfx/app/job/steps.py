@@ -240,8 +240,8 @@ def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
         if not method.any_simulator and not isinstance(parts.simulator, MemorySimulator):
             raise ConfigError(
                 f"calibration.posterior={config.calibration.posterior} simulates each trajectory"
-                " thousands of times, which simulator=memory alone can; take"
-                " calibration.posterior=sbi, or leave one of them out"
+                " too often for any simulator but simulator=memory alone; take"
+                " calibration.posterior=laplace or sbi, or leave one of them out"
             )
     return config, parts
 

@@ -140,6 +140,8 @@ class PriorDrivers:
 class LaplaceMethod(PosteriorMethod):
     """Each driver alone: Laplace's approximation, corrected by weighted samples."""
 
+    any_simulator = True
+
     def find(
         self,
         solver: Solver,
@@ -162,6 +164,8 @@ class LaplaceMethod(PosteriorMethod):
 class NutsMethod(LaplaceMethod):
     """Each driver alone: chains of the No-U-Turn sampler, which start from weighted samples."""
 
+    any_simulator = False
+
     def draws_of(self, solver: Solver, posterior: Posterior, sampled: Sampled) -> Sampled | Chains:
         # JAX is imported by those alone who ask for chains.
         from cfx_posteriors.nuts import walk
@@ -170,7 +174,7 @@ class NutsMethod(LaplaceMethod):
 
 
 class SbiMethod(PosteriorMethod):
-    """Each driver alone, by a network that learns from simulations: whoever simulates.
+    """Each driver alone, by a network that learns from simulations.
 
     Raises:
         NotInstalledError: sbi is not installed.
@@ -208,6 +212,7 @@ class HierarchicalMethod(PosteriorMethod):
     """Each driver as one of a population, which all drivers of the job give."""
 
     has_population = True
+    any_simulator = True
 
     def find(
         self,

@@ -53,7 +53,7 @@ from cfx_posteriors.importance import (
 FIRST = 500
 """Simulations of each driver all over the prior, which give the first region."""
 
-ROUNDS, EPOCHS = 6, 7
+ROUNDS, EPOCHS = 8, 7
 """Rounds at most, and passes over its simulations in each. A flow goes on where it was."""
 
 SIMULATIONS, _LEAST, _MOST = 8000, 100, 300
@@ -75,7 +75,10 @@ _CORRELATIONS = (0.6, 0.0, 0.9)
 _CHECKED = 300
 """Simulations of all drivers that say how often the flow's intervals hold what they should."""
 
-_BATCH, _RATE = 500, 3e-3
+_BATCHES, _LEAST_BATCH, _MOST_BATCH, _RATE = 40, 50, 500, 3e-3
+"""Batches in a pass, unless they would be too small or large: few drivers' flows take as many
+steps."""
+
 _HIDDEN, _READ, _OWN, _TRANSFORMS = 50, 32, 16, 4
 """Width of the layers, what they read of a recording and know of a driver, and the flow's steps."""
 
@@ -413,7 +416,7 @@ def _learn_round(
         normal = torch.distributions.MultivariateNormal(torch.zeros(d), torch.eye(d))
         trainer = NPE(normal, build, show_progress_bars=False, tracker=_Silent())
         flow = trainer.append_simulations(*learned).train(
-            training_batch_size=_BATCH,
+            training_batch_size=min(max(len(learned[0]) // _BATCHES, _LEAST_BATCH), _MOST_BATCH),
             learning_rate=_RATE,
             max_num_epochs=EPOCHS,
             stop_after_epochs=EPOCHS,
