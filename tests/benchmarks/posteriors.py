@@ -55,7 +55,8 @@ CLASSES = 10
 MODELS: dict[str, DrivingModel] = {"krauss": Krauss(), "idm": IDM(), "w99": W99()}
 DRIVERS = {"krauss": 1000, "idm": 300, "w99": 100}
 WALKERS, CHAIN = 40, 4000
-COVERED, REFERENCES, REFERENCE_DRAWS = 60, 2, 100
+COVERED = {"krauss": 60, "idm": 40, "w99": 8}
+REFERENCES, REFERENCE_DRAWS = 2, 100
 BESIDE, IN_SUMO = 6, 2
 GROUP, GROUPS = 8, 6
 FRAMES, AFTER_S = 600, (1, 5, 10, 30)
@@ -252,7 +253,7 @@ def recorded(name: str, drivers: int) -> Posterior:
 
 def covered(name: str) -> Iterator[str]:
     """Yields how often 90 % intervals of chains hold the truth, of synthetic drivers of 60 s."""
-    drawn = draw_recordings(MODELS[name], COVERED, frames=FRAMES, seed=12)
+    drawn = draw_recordings(MODELS[name], COVERED[name], frames=FRAMES, seed=12)
     normal = laplace(drawn.posterior, likely_starts(drawn.posterior, seed=0))
     weighted = sample(drawn.posterior, normal, SHARES, seed=0, memory=1 << 30)
     found = walk(drawn.posterior, weighted, SHARES, seed=0, memory=1 << 30)
@@ -265,7 +266,7 @@ def covered(name: str) -> Iterator[str]:
         counts = torch.stack([torch.histc(r.double(), CLASSES // 2, 0, 20) for r in ranks.T])
         least = min(float(chisquare(one).pvalue) for one in counts.numpy())
         yield (
-            f"{type(MODELS[name]).__name__}, {COVERED} drivers, {label}: held"
+            f"{type(MODELS[name]).__name__}, {COVERED[name]} drivers, {label}: held"
             f" {float(held.mean()):.1%}, each parameter {shares(held)}; ranks"
             f" {' '.join(f'{c:.0f}' for c in counts.sum(0))}, least p {least:.3f}; reliable"
             f" {float((found.r_hat <= MIXED).double().mean()):.0%}, divergent"
