@@ -69,7 +69,6 @@ def test_tensors_on_two_devices_do_not_meet() -> None:
 def _gradient(data: TrainingData, device: torch.device) -> tuple[Tensor, Tensor]:
     """Returns the losses of one step and the slopes of a weight, on the CPU."""
     module = module_of(data)
-    module.network.to(device)
     losses = torch.cat([loss[None] for loss in module.step_losses(0)])
     losses.sum().backward()
     slope = module.network.get_parameter("w_out").grad

@@ -67,7 +67,8 @@ def contract_of(
     Args:
         module: name of the module, which is imported already.
         kind: as in `cfx.get(kind, name)`.
-        first, slow: see `Contract`.
+        first: checks that come first (`Contract.first`).
+        slow: checks that take long (`Contract.slow`).
     """
     checks = []
     for name, function in vars(sys.modules[module]).items():
@@ -212,7 +213,8 @@ def expect_close(
         value: what a component gives.
         expected: what it must give.
         msg: the sentence that says so.
-        rtol, atol: largest relative and absolute difference; None: PyTorch's for the dtype.
+        rtol: largest relative difference; None: PyTorch's for the dtype.
+        atol: largest absolute difference; None: PyTorch's for the dtype.
         equal_nan: whether NaN agrees with NaN.
     """
     import torch

@@ -365,8 +365,15 @@ class PairBatch:
         *,
         dtype: torch.dtype | None = None,
         device: torch.device | str | None = None,
+        frames: int = 0,
     ) -> PairBatch:
         """Stacks pairs; float64 on the CPU unless told otherwise.
+
+        Args:
+            pairs: of one time step.
+            dtype: of the tables.
+            device: of the tables.
+            frames: for how many there is room at least.
 
         Raises:
             DataError: there are no pairs, or their time steps differ.
@@ -377,7 +384,7 @@ class PairBatch:
             raise DataError("no pairs to stack")
         pair_set = pairs if isinstance(pairs, PairSet) else PairSet(tuple(pairs), "pairs")
         dt, dtype = pair_set.dt, dtype or torch.float64
-        length = max(len(pair) for pair in pair_set.pairs)
+        length = max(frames, *(len(pair) for pair in pair_set.pairs))
         shape = (len(pair_set), length)
         signals = {}
         for name in SIGNALS:
@@ -421,6 +428,17 @@ class PairBatch:
         frames = torch.arange(self.mask.shape[1], device=last.device)
         mask = self.mask & (frames <= last[:, None])
         return replace(self, lengths=last + 1, mask=mask).trimmed()
+
+    def followed_by(self, other: PairBatch) -> PairBatch:
+        """Returns these pairs and those of another batch with room for as many frames."""
+        import torch
+
+        joined: dict[str, Any] = {}
+        for one in fields(self):
+            if one.name != "dt":
+                ours, theirs = getattr(self, one.name), getattr(other, one.name)
+                joined[one.name] = torch.cat([ours, theirs.to(ours)])
+        return replace(self, **joined)
 
     def trimmed(self) -> PairBatch:
         """Returns the same pairs without the frames that none of them has."""

@@ -159,6 +159,22 @@ def with_usable_accelerations(pairs: PairSet, how: Accelerations) -> PairSet:
     """
     if how == "recorded":
         return pairs
+    changed, constants = averaged(pairs)
+    if not constants:
+        return pairs
+    log.info(
+        "Accelerations of %d of %d pairs are noisy: averages of their past (time constants of %g to"
+        " %g s) stand for them; data.accelerations=recorded keeps them",
+        len(constants),
+        len(pairs),
+        min(constants),
+        max(constants),
+    )
+    return changed
+
+
+def averaged(pairs: PairSet) -> tuple[PairSet, list[float]]:
+    """Replaces noisy accelerations, and says of each changed pair over how long it averages, s."""
     constants: list[float] = []
 
     def change(pair: Pair) -> Pair:
@@ -173,18 +189,7 @@ def with_usable_accelerations(pairs: PairSet, how: Accelerations) -> PairSet:
             leader_acceleration=ahead.of(pair.leader_acceleration, pair.dt),
         )
 
-    changed = pairs.changed(change)
-    if not constants:
-        return pairs
-    log.info(
-        "Accelerations of %d of %d pairs are noisy: averages of their past (time constants of %g to"
-        " %g s) stand for them; data.accelerations=recorded keeps them",
-        len(constants),
-        len(pairs),
-        min(constants),
-        max(constants),
-    )
-    return changed
+    return pairs.changed(change), constants
 
 
 def best_average(speed: Floats, acceleration: Floats, dt: float) -> Average:

@@ -61,7 +61,7 @@ class SyntheticSettings(DatasetSettings):
     platoon_size: int = Field(
         4, ge=1, description="followers in a platoon; each is the leader of the next"
     )
-    model: Literal["krauss", "w99"] = Field(
+    model: Literal["krauss", "w99", "idm"] = Field(
         "krauss", description="the driving model that the drivers truly follow"
     )
     cruise_mps: tuple[float, float] = Field(
@@ -220,6 +220,10 @@ def _model(name: str) -> DrivingModel:
         from cfx.models.krauss import Krauss
 
         return Krauss()
+    if name == "idm":
+        from cfx.models.idm import IDM
+
+        return IDM()
     from cfx.models.w99 import W99
 
     return W99()

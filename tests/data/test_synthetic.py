@@ -12,13 +12,14 @@ import torch
 from cfx.core.errors import ConfigError
 from cfx.data.pairs import Pair, PairSet
 from cfx.models.base import DrivingModel, Leader
+from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import simulate
 from cfx.simulation.synthetic import SyntheticDataset, leader_speed, smooth_noise
 from cfx.simulation.trajectory import Start, Trajectory
 
-MODELS: dict[str, type[DrivingModel]] = {"krauss": Krauss, "w99": W99}
+MODELS: dict[str, type[DrivingModel]] = {"krauss": Krauss, "w99": W99, "idm": IDM}
 
 
 DIVERSE = {"seed": 5, "pairs": 12, "platoon_size": 4, "frames": 400}
@@ -174,7 +175,7 @@ def test_pairs_that_noise_turns_around_are_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"model": "idm"}, {"variation": 1.5}, {"pairs": 0}, {"dt": 0.0}, {"seed": -1}]
+    "options", [{"model": "w74"}, {"variation": 1.5}, {"pairs": 0}, {"dt": 0.0}, {"seed": -1}]
 )
 def test_refuses_settings_that_make_no_sense(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

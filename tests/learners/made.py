@@ -166,7 +166,7 @@ def module_of(data: TrainingData, **options: Any) -> RolloutModule:
     network = policy.build(dataset.scaler.mean.shape[-1], blank[0], blank, generator)
     with torch.no_grad():
         network.get_parameter("w_out").uniform_(-1.0, 1.0, generator=generator)
-    return module_with(network, dataset, data, settings)
+    return module_with(network.to(data.device), dataset, data, settings)
 
 
 def batch_of(

@@ -41,6 +41,7 @@ from cfx.learners.rollout.shard import (
     shard_checkpoints,
     untrained,
 )
+from cfx.learners.rollout.simulated import with_simulated_drivers
 from cfx.policies import checkpoint as saved
 from cfx.policies.agent import Agent
 from cfx.policies.base import Policy, PolicyNetwork
@@ -113,6 +114,7 @@ class RolloutLearner(Learner):
             log.info(
                 "The policy does not see the gap; policy.inputs=situation gives smaller errors"
             )
+        training_data = with_simulated_drivers(training_data, s.simulated_drivers)
         generator = torch.Generator().manual_seed(training_data.seed)
         head = head_class(s.head).for_model(simulator.model)
         dataset = RolloutDataset.of(training_data, policy, head, s, generator)

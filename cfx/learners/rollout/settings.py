@@ -121,6 +121,14 @@ class TrajectorySettings(Settings):
         " the cold starts, which makes motorways of congestion: accelerations stay, and the gap"
         " grows by the driver's own time gap; 0: none",
     )
+    simulated_drivers: int = Field(
+        0,
+        ge=0,
+        le=100_000,
+        description="drivers of Krauss's model and of IDM in stop-and-go traffic of 2 to 6 m/s,"
+        " from whom networks learn too, for roads that are slower than those that were recorded;"
+        " 0: none",
+    )
 
 
 class LossSettings(Settings):

@@ -1,0 +1,112 @@
+"""Simulated drivers, from whom networks learn beside the recorded ones.
+
+Hardly any recording of free traffic has vehicles that crawl, and a policy is wrong where it has
+learned nothing. Drivers of Krauss's model and of IDM, who differ from one another, follow leaders
+in stop-and-go traffic (`cfx.simulation.synthetic`). They are a site of their own, so
+`learner.balance` says how often they are sampled, and no constant parameters are calibrated on
+them: the base of each is the pooled set of the network.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import averaged
+from cfx.learners.base import TrainingData, TrainingPairs
+from cfx.simulation.synthetic import SyntheticDataset
+from cfx.simulation.windows import Split
+
+SITE = "simulated"
+"""Where they drive."""
+
+_MODELS = ("krauss", "idm")
+_CRUISE_MPS = (2.0, 6.0)
+_HETEROGENEITY, _VARIATION = 0.5, 0.2
+_LASTS_S = 60.0
+
+
+def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingData:
+    """Adds drivers to what each of N networks learns from.
+
+    Args:
+        training_data: P recorded pairs.
+        count: simulated drivers, S; half of them drive by each model.
+
+    Returns:
+        P + N S pairs, one network behind the other.
+    """
+    if count == 0:
+        return training_data
+    frames = training_data.recorded.mask.shape[1]
+    drivers = simulated_drivers(count, training_data.simulator.dt, frames, training_data.seed)
+    recorded, pairs = training_data.recorded, training_data.pairs
+    batch = PairBatch.of(drivers, device=training_data.device, frames=frames)
+    whole = Split.none(drivers, training_data.windows)
+    networks, device = len(training_data.names), pairs.index.device
+    added = torch.arange(count, device=device).repeat(networks)
+    network = torch.arange(networks, device=device).repeat_interleave(count)
+    pooled = _first_of_each(pairs.fixed, pairs.network)[network.to(pairs.fixed.device)]
+    order = torch.cat([pairs.network, network]).argsort(stable=True)
+
+    def joined(ours: Tensor, theirs: Tensor) -> Tensor:
+        return torch.cat([ours, theirs.to(ours)])[order.to(ours.device)]
+
+    def named(ours: tuple[str, ...], theirs: list[str]) -> tuple[str, ...]:
+        names = [*ours, *theirs * networks]
+        return tuple(names[number] for number in order.tolist())
+
+    sites = pairs.sites or ("",) * len(pairs)
+    return replace(
+        training_data,
+        recorded=recorded.followed_by(batch),
+        pairs=TrainingPairs(
+            index=joined(pairs.index, len(recorded) + added),
+            split=Split(
+                joined(pairs.split.frame, whole.frame.to(added.device)[added]),
+                joined(pairs.split.windows, whole.windows.to(added.device)[added]),
+            ),
+            network=joined(pairs.network, network),
+            fixed=joined(pairs.fixed, pooled),
+            base=None if pairs.base is None else joined(pairs.base, pooled),
+            drivers=named(pairs.known_drivers, [f"{SITE} {pair.pair_id}" for pair in drivers]),
+            sites=named(sites, [SITE] * count),
+        ),
+    )
+
+
+def simulated_drivers(count: int, dt: float, frames: int, seed: int) -> PairSet:
+    """Simulates drivers in stop-and-go traffic.
+
+    Args:
+        count: how many.
+        dt: time step, s.
+        frames: of each at most; fewer are simulated where a minute has fewer.
+        seed: same seed, same drivers.
+    """
+    pairs = []
+    for number, model in enumerate(_MODELS[:count]):
+        dataset = SyntheticDataset(
+            seed=seed + number,
+            pairs=(count + len(_MODELS) - 1 - number) // len(_MODELS),
+            frames=min(frames, round(_LASTS_S / dt)),
+            dt=dt,
+            model=model,
+            cruise_mps=_CRUISE_MPS,
+            heterogeneity=_HETEROGENEITY,
+            variation=_VARIATION,
+        )
+        for pair in dataset.read():
+            pairs.append(replace(pair, pair_id=f"{model} {pair.pair_id}"))
+    return averaged(PairSet(tuple(pairs), SITE))[0]
+
+
+def _first_of_each(values: Tensor, network: Tensor) -> Tensor:
+    """Returns the first row of each of N networks, `(N, n)`, of values `(P, n)`."""
+    rows = torch.arange(len(network), device=network.device)
+    first = torch.full_like(rows[: int(network.max()) + 1], len(rows))
+    first = first.scatter_reduce(0, network, rows, "amin")
+    return values[first.to(values.device)]
