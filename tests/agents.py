@@ -12,11 +12,11 @@ from cfx.models.base import DrivingModel
 from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.base import DirectHead, ParameterHead
 from cfx.policies.heads.offset import OffsetHead
 from cfx.policies.heads.residual import ResidualHead
 from cfx.policies.heads.stochastic import StochasticHead
-from cfx.policies.recurrent import GruPolicy
 from cfx.simulation.windows import WindowSettings
 
 INPUTS = ("leader_speed", "follower_speed", "gap", "follower_acceleration", "leader_acceleration")

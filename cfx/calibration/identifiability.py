@@ -21,7 +21,8 @@ from torch import Tensor
 
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives import GapRmse, Objective, SpeedRmse
+from cfx.calibration.objectives import Objective
+from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.core import memory
 from cfx.data.pairs import PairBatch
 

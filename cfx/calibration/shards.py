@@ -17,8 +17,9 @@ from torch import Tensor
 
 from cfx.calibration.cache import Arrays
 from cfx.calibration.losses import FullTrajectories, PooledLosses, Prior, SegmentLosses
-from cfx.calibration.objectives import Objective, SpeedRmse
+from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import Optimizer, Solution
+from cfx.calibration.rmse import SpeedRmse
 from cfx.core import registry
 from cfx.core.component import content_key, folder_hash
 from cfx.core.engine import Report, Unfit

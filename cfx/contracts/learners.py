@@ -23,9 +23,9 @@ from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore, Ensemble, features_read
 from cfx.policies.features import measured_history
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.recurrent import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split, Windows, WindowSettings

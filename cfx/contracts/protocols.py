@@ -16,7 +16,7 @@ import torch
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.contracts import NotApplicable, contract_of, once
 from cfx.data.pairs import Pair, PairBatch, PairSet
@@ -28,7 +28,7 @@ from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
 from cfx.policies.base import Policy
 from cfx.policies.constant import FixedPolicy
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import WindowSettings

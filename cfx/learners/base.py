@@ -17,7 +17,8 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
-from cfx.calibration.objectives import Objective, SpeedRmse
+from cfx.calibration.objectives import Objective
+from cfx.calibration.rmse import SpeedRmse
 from cfx.core.component import Component
 from cfx.core.engine import Engine
 from cfx.core.errors import ConfigError

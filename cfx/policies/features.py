@@ -47,7 +47,6 @@ _STANDING = 1.0
 """Speed in m/s below which time headway and inverse time to collision are taken at this speed: they
 have poles at 0."""
 
-
 _FRAME_S = 0.1
 """Time between frames for which jerk is in m/s3; a network's scaler takes out what differs."""
 

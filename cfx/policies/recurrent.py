@@ -3,24 +3,19 @@
 The equations, gate order and initialisation are those of `torch.nn.GRU` and `torch.nn.LSTM` (which
 cannot be batched over their weights: `torch.func.vmap` has no rule for them); a test holds them
 equal.
-
-Sources: K. Cho et al. (2014), *Learning phrase representations using RNN encoder-decoder*, EMNLP;
-S. Hochreiter and J. Schmidhuber (1997), *Long short-term memory*, Neural Computation 9(8); F. Gers
-et al. (2000).
 """
 
 from __future__ import annotations
 
 import math
-from typing import ClassVar, Literal
+from typing import Literal
 
 import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from cfx.core.component import Settings
 from cfx.core.memory import require_memory
-from cfx.policies.base import Policy, PolicyNetwork, PolicySettings
+from cfx.policies.base import PolicyNetwork, PolicySettings
 
 _BYTES = 16.0
 """Of a weight in training: itself, its gradient and what Adam remembers of it."""
@@ -157,58 +152,3 @@ class RecurrentNetwork(PolicyNetwork):
             carried: before the window, `(*batch, states * width)`.
         """
         raise NotImplementedError
-
-
-class GruNetwork(RecurrentNetwork):
-    """N gated recurrent units, in the form of `torch.nn.GRU`."""
-
-    gates = 3
-    states = 1
-
-    @staticmethod
-    def cell(projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:
-        two = 2 * (projected.shape[-1] // 3)
-        gates = (projected[..., :two] + recurrent[..., :two]).sigmoid()
-        reset, update = gates.chunk(2, dim=-1)
-        new = torch.tanh(projected[..., two:] + reset * recurrent[..., two:])
-        return torch.lerp(new, carried, update)
-
-
-class LstmNetwork(RecurrentNetwork):
-    """N long short-term memories as `torch.nn.LSTM`; carries the output and the cell."""
-
-    gates = 4
-    states = 2
-
-    @staticmethod
-    def cell(projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:
-        memory = carried[..., carried.shape[-1] // 2 :]
-        h = projected.shape[-1] // 4
-        gates = projected + recurrent
-        let_in, forget = gates[..., : 2 * h].sigmoid().chunk(2, dim=-1)
-        memory = forget * memory + let_in * gates[..., 2 * h : 3 * h].tanh()
-        return torch.cat([gates[..., 3 * h :].sigmoid() * memory.tanh(), memory], dim=-1)
-
-
-class GruPolicy(Policy):
-    """The paper's policy: a recurrent network whose outputs stay in the parameters' bounds.
-
-    Differences from the paper: it does not say whether the network's memory outlives a window; here
-    it does, for the whole trajectory. Training starts from the fixed parameters (`start=middle`
-    does not): a network that learns little then does little harm.
-    """
-
-    schema: ClassVar[type[Settings]] = RecurrentSettings
-    settings: RecurrentSettings
-    network: ClassVar[type[RecurrentNetwork]] = GruNetwork
-
-    def build(
-        self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
-    ) -> PolicyNetwork:
-        return self.network(features, fixed, self.settings, generator)
-
-
-class LstmPolicy(GruPolicy):
-    """As `gru`, with long short-term memories."""
-
-    network = LstmNetwork

@@ -17,7 +17,7 @@ import torch
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.core import registry
 from cfx.core.threads import limit_cores

@@ -22,8 +22,9 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.objectives import FrameValues, Objective, SpeedRmse
-from cfx.calibration.search import GradientSearch
+from cfx.calibration.gradient_search import GradientSearch
+from cfx.calibration.objectives import FrameValues, Objective
+from cfx.calibration.rmse import SpeedRmse
 from cfx.calibration.shards import Solver
 from cfx.core import registry
 from cfx.data.pairs import SIGNALS, Pair, PairBatch, PairSet

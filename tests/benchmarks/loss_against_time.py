@@ -19,8 +19,8 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives import SpeedRmse
 from cfx.calibration.optimizers import Optimizer
+from cfx.calibration.rmse import SpeedRmse
 from cfx.core import registry
 from cfx.core.threads import limit_cores
 from cfx.data.pairs import PairBatch

@@ -24,7 +24,7 @@ from scipy.stats import chisquare
 from scoringrules import crps_ensemble
 from torch import Tensor
 
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.settings import DETERMINED, MIXED, RELIABLE, CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.core.registry import create

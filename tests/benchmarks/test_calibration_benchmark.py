@@ -18,9 +18,9 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.losses import PooledLosses, SegmentLosses
-from cfx.calibration.objectives import SpeedRmse
 from cfx.calibration.optimizers import sobol
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
+from cfx.calibration.rmse import SpeedRmse
 from cfx.core import registry, threads
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import MemoryStepper

@@ -17,7 +17,7 @@ from cfx.core.threads import cores, limit_cores
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.models.krauss import Krauss
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from tests.benchmarks.test_rollout_learning_benchmark import POLICY, _training_data
 
 NETWORKS, EPOCHS = 6, 12

@@ -20,9 +20,10 @@ from botorch.optim import optimize_acqf
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from torch import Tensor
 
+from cfx.calibration.gradient_search import GradientSearch
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives import SpeedRmse
-from cfx.calibration.search import GradientSearch, RandomSearch
+from cfx.calibration.random_search import RandomSearch
+from cfx.calibration.rmse import SpeedRmse
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99

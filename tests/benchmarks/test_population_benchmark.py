@@ -15,7 +15,7 @@ import pytest
 import torch
 
 from cfx.calibration.losses import PooledLosses, SegmentLosses
-from cfx.calibration.objectives import SpeedRmse
+from cfx.calibration.rmse import SpeedRmse
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99

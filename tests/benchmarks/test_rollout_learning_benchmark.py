@@ -23,8 +23,8 @@ from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.offset import NONE, OffsetHead
-from cfx.policies.recurrent import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, WindowSettings
 from tests.drives import wavy_pairs

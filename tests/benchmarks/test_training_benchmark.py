@@ -15,7 +15,7 @@ from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, Windows, WindowSettings
 from tests.drives import straight_pairs

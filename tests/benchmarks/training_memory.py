@@ -14,8 +14,8 @@ import torch
 
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.settings import RolloutSettings
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class
-from cfx.policies.recurrent import GruPolicy
 from tests.learners.made import training_data
 
 

@@ -27,7 +27,7 @@ from cfx.calibration import calibrator as module
 from cfx.calibration.cache import Cache
 from cfx.calibration.shards import Solver
 from cfx.models.krauss import Krauss
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.data.pairs import PairBatch
 from cfx.core.progress import Task
 from cfx.simulation.rollout import MemoryStepper

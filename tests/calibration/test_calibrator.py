@@ -13,10 +13,15 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.objectives import GapRmse, Mixed, Objective, SpeedHuber, SpeedRmse, TheilU
+from cfx.calibration.gradient_search import GradientSearch
+from cfx.calibration.huber import SpeedHuber
+from cfx.calibration.mixed import Mixed
+from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import CandidateLosses, Optimizer
-from cfx.calibration.search import GradientSearch, RandomSearch
+from cfx.calibration.random_search import RandomSearch
+from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.calibration.shards import CalibrationShard, Solver
+from cfx.calibration.theil_u import TheilU
 from cfx.core import threads
 from cfx.core.engine import Engine, Report
 from cfx.core.errors import OutputError

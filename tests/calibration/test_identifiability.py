@@ -11,7 +11,7 @@ import torch
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.identifiability import PLACES, slices, training_errors
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.models.krauss import Krauss

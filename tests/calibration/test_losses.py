@@ -6,7 +6,10 @@ import pytest
 import torch
 
 from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
-from cfx.calibration.objectives import FrameValues, GapRmse, Mixed, Objective, SpeedRmse, TheilU
+from cfx.calibration.mixed import Mixed
+from cfx.calibration.objectives import FrameValues, Objective
+from cfx.calibration.rmse import GapRmse, SpeedRmse
+from cfx.calibration.theil_u import TheilU
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
 from cfx.models.krauss import Krauss

@@ -12,10 +12,11 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
+from cfx.calibration.gradient_search import GradientSearch
 from cfx.calibration.losses import Prior, SegmentLosses, prior_weight
-from cfx.calibration.objectives import SpeedRmse
 from cfx.calibration.optimizers import Optimizer
-from cfx.calibration.search import GradientSearch, RandomSearch
+from cfx.calibration.random_search import RandomSearch
+from cfx.calibration.rmse import SpeedRmse
 from cfx.calibration.shards import Solver
 from cfx.core.parameters import Parameter, ParameterSpace, squashed
 from cfx.data.pairs import PairBatch

@@ -8,7 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.calibration.objectives import FrameValues, Objective, SpeedRmse, TheilU, root_mean_square
+from cfx.calibration.objectives import FrameValues, Objective, root_mean_square
+from cfx.calibration.rmse import SpeedRmse
+from cfx.calibration.theil_u import TheilU
 from cfx.contracts import check_contract
 from cfx.contracts import objectives as checks
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.optimizers import CandidateLosses, Optimizer
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.contracts import check_contract, violations
 from cfx.contracts import optimizers as checks
 from cfx.core.errors import PluginError

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from cfx.contracts import policies as checks
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 
 Change = Callable[[nn.Module, Tensor], Tensor]
 

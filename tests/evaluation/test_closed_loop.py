@@ -20,8 +20,8 @@ from cfx.policies.base import Policy
 from cfx.policies.constant import ConstantNetwork, FixedPolicy
 from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.base import DirectHead
-from cfx.policies.recurrent import GruPolicy
 from cfx.simulation.rollout import MemoryStepper, simulate
 from cfx.simulation.trajectory import Start
 from cfx.simulation.windows import WindowSettings

@@ -16,7 +16,7 @@ from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.forecasts import LeaderFuture, Origins, measured_paths
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx_forecasts.errors import (
     errors_by,

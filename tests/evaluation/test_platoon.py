@@ -23,7 +23,7 @@ from cfx.evaluation.platoon import (
 from cfx.evaluation.result import Platoon
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.krauss import Krauss
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx_sumo.vtype import SumoVType
 from tests.agents import adaptive as live

@@ -15,7 +15,7 @@ from cfx.evaluation import closed_loop
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop, simulate_in_shards
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import TrainedOn
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 from tests.evaluation.test_closed_loop import adaptive

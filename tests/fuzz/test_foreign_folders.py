@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import cfx
 from cfx.app import cli
 from cfx.core.errors import CfxError
-from cfx.evaluation.protocols.finished import Transfer, TransferSettings
+from cfx.evaluation.protocols.transfer import Transfer, TransferSettings
 from cfx.policies import checkpoint
 from cfx_report.page import render
 from cfx_report.runs import read_runs

@@ -22,8 +22,8 @@ from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.core import AgentCore
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class, head_name
-from cfx.policies.recurrent import GruPolicy
 from cfx.simulation.kernel import compiler
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, WindowSettings

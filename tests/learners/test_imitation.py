@@ -20,7 +20,7 @@ from cfx.policies.checkpoint import load, save
 from cfx.policies.context import DriverContext
 from cfx.policies.core import group_by
 from cfx.policies.features import measured_history
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, Windows, WindowSettings
 from tests.drives import wavy_pairs

@@ -25,7 +25,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.context import DriverContext
 from cfx.policies.driver_features import DRIVER_FEATURES, LEAST, MOVING, measure
 from cfx.policies.features import History, measured_history
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from tests.agents import adaptive
 from tests.drives import straight_pairs, wavy_pairs
 

@@ -11,8 +11,8 @@ from torch import Tensor
 from cfx.contracts import policies as checks
 from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork
 from cfx.policies.core import Ensemble
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.offset import NONE
-from cfx.policies.recurrent import GruPolicy
 
 
 class Three(GruPolicy):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.search import GradientSearch
+from cfx.calibration.gradient_search import GradientSearch
 from cfx.calibration.shards import Solver
 from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError

@@ -9,7 +9,9 @@ from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.policies.base import Policy
 from cfx.policies.features import INPUT_SETS, INPUTS, History, Scaler, token_width, tokens
-from cfx.policies.recurrent import GruPolicy, LstmPolicy, RecurrentNetwork
+from cfx.policies.gru import GruPolicy
+from cfx.policies.lstm import LstmPolicy
+from cfx.policies.recurrent import RecurrentNetwork
 
 
 @pytest.mark.parametrize("component", [GruPolicy, LstmPolicy])

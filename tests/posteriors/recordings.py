@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives import GapRmse, SpeedRmse
+from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.data.pairs import PairBatch
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import MemoryStepper

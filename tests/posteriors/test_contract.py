@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from cfx.calibration.posterior import posterior_method
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.core import registry

@@ -29,8 +29,8 @@ from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler, token_width
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.base import DirectHead
-from cfx.policies.recurrent import GruPolicy
 from cfx.results import provenance
 from cfx.results.config import JobConfig
 from cfx.results.table import Findings, Kept, ResultTable, WrittenTable

@@ -9,7 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.calibration.objectives import FrameValues, Objective, SpeedRmse
+from cfx.calibration.objectives import FrameValues, Objective
+from cfx.calibration.rmse import SpeedRmse
 from cfx.core import registry, threads
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.composed import WithResidual

@@ -18,7 +18,8 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.objectives import FrameValues, GapRmse, Objective, SpeedRmse
+from cfx.calibration.objectives import FrameValues, Objective
+from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.settings import LossSettings

@@ -12,7 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfx import FrameValues, Objective
-from cfx.calibration.objectives import GapRmse, Mixed, SpeedHuber, SpeedRmse, TheilU
+from cfx.calibration.huber import SpeedHuber
+from cfx.calibration.mixed import Mixed
+from cfx.calibration.rmse import GapRmse, SpeedRmse
+from cfx.calibration.theil_u import TheilU
 from cfx.contracts import check_contract
 from cfx.core import registry
 from cfx.core.errors import OWN, ConfigError

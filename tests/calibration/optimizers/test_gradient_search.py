@@ -8,7 +8,8 @@ from pydantic import ValidationError
 from scipy.optimize import minimize
 from torch import Tensor
 
-from cfx.calibration.search import GradientSearch, RandomSearch, _stages
+from cfx.calibration.gradient_search import GradientSearch, _stages
+from cfx.calibration.random_search import RandomSearch
 from cfx.contracts import check_contract
 from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.core.errors import ConfigError

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.core.errors import ConfigError
 

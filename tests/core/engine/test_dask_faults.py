@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.core.engine import Engine
 from cfx.core.errors import EngineError

@@ -16,7 +16,7 @@ import torch
 import cfx
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
-from cfx.calibration.search import RandomSearch
+from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.contracts import protocols
 from cfx.core.errors import DataError
@@ -31,7 +31,7 @@ from cfx.policies.base import Policy
 from cfx.policies.constant import DefaultPolicy, FixedPolicy
 from cfx.policies.core import Ensemble
 from cfx.policies.features import History
-from cfx.policies.recurrent import GruPolicy
+from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split, WindowSettings

@@ -17,7 +17,7 @@ from cfx.core.errors import CfxError, DataError, TrackingError
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.tidy import TidyDataset, frame_of, write_tidy
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.evaluation.protocols.finished import Transfer
+from cfx.evaluation.protocols.transfer import Transfer
 from cfx.policies import checkpoint
 from cfx.policies.core import ALL
 from cfx.simulation.rollout import MemoryStepper

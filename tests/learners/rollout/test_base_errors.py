@@ -7,7 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.calibration.objectives import GapRmse, TheilU
+from cfx.calibration.rmse import GapRmse
+from cfx.calibration.theil_u import TheilU
 from cfx.learners.rollout import loss
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.loss import BaseErrors

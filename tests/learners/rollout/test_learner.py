@@ -10,7 +10,11 @@ import pandas as pd
 import pytest
 import torch
 
-from cfx.calibration.objectives import GapRmse, Mixed, Objective, SpeedHuber, SpeedRmse, TheilU
+from cfx.calibration.huber import SpeedHuber
+from cfx.calibration.mixed import Mixed
+from cfx.calibration.objectives import Objective
+from cfx.calibration.rmse import GapRmse, SpeedRmse
+from cfx.calibration.theil_u import TheilU
 from cfx.core.errors import ConfigError
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner
@@ -19,7 +23,8 @@ from cfx.learners.rollout.shard import checkpoint_path
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.core import Ensemble
-from cfx.policies.recurrent import GruPolicy, LstmPolicy
+from cfx.policies.gru import GruPolicy
+from cfx.policies.lstm import LstmPolicy
 from cfx.simulation.rollout import MemoryStepper
 from tests.learners.made import (
     COMPILED,

@@ -19,8 +19,9 @@ from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.base import Policy
+from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class
-from cfx.policies.recurrent import GruPolicy, LstmPolicy
+from cfx.policies.lstm import LstmPolicy
 from cfx.simulation.kernel import compiler
 from tests.learners.made import INPUTS, QUICK, module_with, training_data
 

@@ -1,7 +1,4 @@
-"""Optimizers of cfx's own: space-filling points, alone or with local searches from the best.
-
-I. M. Sobol' (1967), *On the distribution of points in a cube and the approximate evaluation of
-integrals*; scrambling after A. B. Owen (1998) and J. Matousek (1998), as PyTorch implements it.
+"""The optimizer `gradient`: space-filling points, and local searches from the best.
 
 J. Nocedal and S. J. Wright (2006), *Numerical Optimization*, second edition: BFGS (chapter 6),
 finite differences (chapter 8), projection onto bounds (chapter 16).
@@ -17,13 +14,12 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from cfx.calibration.optimizers import (
-    AT_ONCE,
     CandidateLosses,
-    Optimizer,
     Tried,
     check_room,
     sobol,
 )
+from cfx.calibration.random_search import RandomSearch, RandomSettings
 from cfx.core.component import Settings
 
 _DIFFERENCE = 1e-6
@@ -41,44 +37,6 @@ _LENGTHS = (3.0, 1.0, 0.5, 0.2, 0.05, 0.01)
 
 _FIRST_RADIUS, _LARGEST_RADIUS, _SMALLEST_RADIUS = 0.1, 0.5, 1e-6
 """Length of one step in any coordinate of unit space."""
-
-
-class RandomSettings(Settings):
-    """Settings of `RandomSearch`."""
-
-    samples: int = Field(4096, ge=1, description="evaluations of each problem, guesses included")
-
-
-class RandomSearch(Optimizer):
-    """Evaluates the guesses and the same scrambled Sobol points in every problem.
-
-    The points are the same for every problem, so that neighbouring windows are compared on the same
-    ground, and a problem's result does not depend on its companions.
-    """
-
-    schema: ClassVar[type[Settings]] = RandomSettings
-    settings: RandomSettings
-    trial: ClassVar[Mapping[str, Any]] = {"samples": 1024}
-    in_threads = True
-
-    def evaluations(self) -> int:
-        return self.settings.samples
-
-    def evaluations_at_once(self) -> int:
-        return min(AT_ONCE, self.settings.samples)
-
-    def bytes_per_problem(self, n: int) -> int:
-        return 8 * self.evaluations_at_once() * (n + 2)
-
-    def solve(
-        self, objective: CandidateLosses, guesses: Tensor, *, seed: int
-    ) -> tuple[Tried, Tensor]:
-        problems, g, n = guesses.shape
-        check_room(self.settings.samples, g, key="samples")
-        points = sobol(self.settings.samples - g, n, seed=seed, like=guesses)
-        blocks = (guesses, points.expand(problems, -1, -1))
-        losses = torch.cat([objective(guesses), objective(blocks[1])], dim=1)
-        return blocks, losses
 
 
 class GradientSettings(RandomSettings):
