@@ -49,7 +49,9 @@ def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingD
     networks, device = len(training_data.names), pairs.index.device
     added = torch.arange(count, device=device).repeat(networks)
     network = torch.arange(networks, device=device).repeat_interleave(count)
-    pooled = _first_of_each(pairs.fixed, pairs.network)[network.to(pairs.fixed.device)]
+    # All recorded pairs of a network start from its pooled set.
+    first = torch.searchsorted(pairs.network, network)
+    pooled = pairs.fixed[first.to(pairs.fixed.device)]
     order = torch.cat([pairs.network, network]).argsort(stable=True)
 
     def joined(ours: Tensor, theirs: Tensor) -> Tensor:
@@ -102,11 +104,3 @@ def simulated_drivers(count: int, dt: float, frames: int, seed: int) -> PairSet:
         for pair in dataset.read():
             pairs.append(replace(pair, pair_id=f"{model} {pair.pair_id}"))
     return averaged(PairSet(tuple(pairs), SITE))[0]
-
-
-def _first_of_each(values: Tensor, network: Tensor) -> Tensor:
-    """Returns the first row of each of N networks, `(N, n)`, of values `(P, n)`."""
-    rows = torch.arange(len(network), device=network.device)
-    first = torch.full_like(rows[: int(network.max()) + 1], len(rows))
-    first = first.scatter_reduce(0, network, rows, "amin")
-    return values[first.to(values.device)]
