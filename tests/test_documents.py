@@ -15,12 +15,12 @@ import yaml
 
 import cfx
 from cfx.app.hydra_source import composed
-from cfx.contracts import contract_for
 from cfx.core import registry
 from cfx.data.tidy import write_tidy
 from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import simulate
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx_contracts import contract_for
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 from tests.printed import Reader, all_blocks, blocks
@@ -244,7 +244,7 @@ def test_the_model_in_the_guide_can_be_simulated() -> None:
 
 def test_the_table_of_kinds_names_what_is_there() -> None:
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
-    row = r"^\| (\w+) \| `cfx\.(\w+)` \| .* \| `(cfx\.contracts\.\w+)` \|$"
+    row = r"^\| (\w+) \| `cfx\.(\w+)` \| .* \| `(cfx_contracts\.\w+)` \|$"
     rows = re.findall(row, text, flags=re.MULTILINE)
     assert {kind for kind, _, _ in rows} == set(registry.KINDS)
     for kind, base, module in rows:

@@ -15,9 +15,9 @@ import pytest
 
 import cfx
 from cfx.app import application, cli
-from cfx.app.plugins.new import create
 from cfx.core import registry
 from cfx.core.errors import ConfigError, OutputError, PluginError
+from cfx_contracts.new import create
 from tests.broken_plugins import BROKEN, QUICK, Broken
 from tests.conftest import ROOT, Installer
 
@@ -522,7 +522,7 @@ def test_a_new_package_is_clean(novel: Path) -> None:
     rules = "B,C4,E,F,I,N,PERF,PIE,RET,SIM,UP,W"
     command = [sys.executable, "-m", "ruff", "check", "--isolated", "--no-cache", "--select", rules]
     command += ["--line-length", "100", "--config", "src=['*']"]
-    command += ["--config", "lint.isort.known-third-party=['cfx']"]
+    command += ["--config", "lint.isort.known-third-party=['cfx','cfx_contracts']"]
     done = subprocess.run(command, cwd=novel, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -532,15 +532,18 @@ def test_the_templates_are_in_the_wheel(tmp_path: Path) -> None:
 
     script = "import sys; from hatchling.build import build_wheel; print(build_wheel(sys.argv[1]))"
     subprocess.run(
-        [sys.executable, "-c", script, tmp_path], cwd=ROOT, capture_output=True, check=True
+        [sys.executable, "-c", script, tmp_path],
+        cwd=ROOT / "plugins" / "cfx-contracts",
+        capture_output=True,
+        check=True,
     )
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as archive:
         names = set(archive.namelist())
-    template = ROOT / "cfx" / "app" / "plugins" / "template"
+    package = ROOT / "plugins" / "cfx-contracts"
     expected = {
-        f"cfx/app/plugins/template/{path.relative_to(template).as_posix()}"
-        for path in template.rglob("*")
+        path.relative_to(package).as_posix()
+        for path in (package / "cfx_contracts" / "template").rglob("*")
         if path.is_file()
     }
     assert len(expected) > 20

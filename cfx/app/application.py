@@ -39,13 +39,13 @@ from cfx.app.sweep.folder import (
     only_one,
 )
 from cfx.app.user_errors import explain, explained, is_user_error
-from cfx.core import registry
 from cfx.core.console import console_logging
 from cfx.core.errors import (
     CfxError,
     ConfigError,
     JobFailedError,
     Terminated,
+    in_words,
     printable,
     without_passwords,
 )
@@ -301,7 +301,7 @@ def _run_job(values: Mapping[str, Any], folder: Path, run_job: RunJob | None) ->
         blamed: CfxError | None = blame(error)
         if blamed is None and is_out_of_memory(error):
             blamed = CfxError(
-                f"memory ran out ({registry.in_words(error)}); take fewer pairs (data.max_pairs),"
+                f"memory ran out ({in_words(error)}); take fewer pairs (data.max_pairs),"
                 " smaller networks or a smaller simulator.memory_mb"
             )
         if blamed is None:

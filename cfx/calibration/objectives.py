@@ -49,7 +49,7 @@ class Objective(Component):
 
     A subclass implements `terms` and `finish`: pure functions of tensors without Python branches on
     their values, on any device, in float32 and float64, differentiable wherever the loss is.
-    `cfx.contracts.objectives` tests all this.
+    `cfx_contracts.objectives` tests all this.
 
     Punzo, Zheng and Montanino (2021), *About calibration of car-following dynamics of automated and
     human-driven vehicles: Methodology, guidelines and codes*, Transportation Research Part C, find

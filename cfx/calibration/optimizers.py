@@ -105,7 +105,7 @@ class Optimizer(Component):
     reduces it to a `Solution`. A subclass implements `solve`, `evaluations` and
     `bytes_per_problem`. It keeps no state between calls. The result of a problem must not depend on
     which other problems stand beside it, beyond rounding.
-    `cfx.contracts.optimizers` tests all this.
+    `cfx_contracts.optimizers` tests all this.
     """
 
     kind = "optimizer"

@@ -105,6 +105,12 @@ def first_line(error: BaseException) -> str:
     return next((line for line in lines if line), type(error).__name__)
 
 
+def in_words(error: BaseException) -> str:
+    """Returns an error's type and the first line of its text."""
+    first = next(iter(str(error).splitlines()), "")
+    return f"{type(error).__name__}: {first}".rstrip(": ")
+
+
 def listed(values: Iterable[object], limit: int = 12) -> str:
     """Returns the values separated by commas, cut off after `limit` of them."""
     texts = [str(value) for value in values]
@@ -119,6 +125,7 @@ _BROUGHT: dict[str, dict[str, tuple[str, ...]]] = {
     "cfx-botorch": {"optimizer": ("botorch",)},
     "cfx-classics": {"model": ("fvdm", "gipps", "gipps_delay", "newell", "ovm", "ovm_city")},
     "cfx-cma": {"optimizer": ("cma",)},
+    "cfx-contracts": {"command": ("plugins.check", "plugins.new")},
     "cfx-dask": {"engine": ("dask",), "hydra/launcher": ("dask",)},
     f"{OWN}[joblib]": {"hydra/launcher": ("joblib",)},
     f"{OWN}[submitit]": {"hydra/launcher": ("submitit_local", "submitit_slurm")},

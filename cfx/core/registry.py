@@ -35,6 +35,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from cfx.core.component import API_VERSION, Component, Settings, validate
+from cfx.core.contract import violations
 from cfx.core.errors import (
     OWN,
     CfxError,
@@ -42,6 +43,7 @@ from cfx.core.errors import (
     PluginError,
     Terminated,
     advice,
+    in_words,
     nearest,
 )
 from cfx.core.guest import same_environment
@@ -66,7 +68,7 @@ class Kind:
         name: as in `cfx.get(kind, name)`.
         base: module and class that its components extend.
         group: its config group, the folder in `conf/` and the key in configs; by default its name.
-        is_tried: a new component is held to the `first` statements of its contract; base classes of
+        first: module and name of the statements that a new component is held to; base classes of
             the other kinds check what a component gives.
         chosen: a job chooses one of this kind, by a config group; metrics are all measured, tables
             are all written, and sub-commands are none of a job.
@@ -75,7 +77,7 @@ class Kind:
     name: str
     base: str
     group: str = ""
-    is_tried: bool = False
+    first: str = ""
     chosen: bool = True
 
     def __post_init__(self) -> None:
@@ -101,11 +103,23 @@ KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         Kind("dataset", "cfx.data.base:Dataset", group="data"),
-        Kind("model", "cfx.models.base:DrivingModel", is_tried=True),
-        Kind("policy", "cfx.policies.base:Policy", is_tried=True),
-        Kind("optimizer", "cfx.calibration.optimizers:Optimizer", is_tried=True),
-        Kind("simulator", "cfx.simulation.base:Simulator", is_tried=True),
-        Kind("objective", "cfx.calibration.objectives:Objective", is_tried=True),
+        Kind("model", "cfx.models.base:DrivingModel", first="cfx.models.contract:FIRST"),
+        Kind("policy", "cfx.policies.base:Policy", first="cfx.policies.contract:FIRST"),
+        Kind(
+            "optimizer",
+            "cfx.calibration.optimizers:Optimizer",
+            first="cfx.calibration.contract:FIRST_OF_OPTIMIZERS",
+        ),
+        Kind(
+            "simulator",
+            "cfx.simulation.base:Simulator",
+            first="cfx.simulation.contract:FIRST",
+        ),
+        Kind(
+            "objective",
+            "cfx.calibration.objectives:Objective",
+            first="cfx.calibration.contract:FIRST_OF_OBJECTIVES",
+        ),
         Kind("engine", "cfx.core.engine:Engine"),
         Kind("learner", "cfx.learners.base:Learner"),
         Kind("protocol", "cfx.evaluation.protocols.base:Protocol"),
@@ -113,7 +127,7 @@ KINDS: dict[str, Kind] = {
             "metric",
             "cfx.evaluation.metrics.base:Metric",
             group="metrics",
-            is_tried=True,
+            first="cfx.evaluation.metrics.contract:FIRST",
             chosen=False,
         ),
         Kind("table", "cfx.results.table:ResultTable", chosen=False),
@@ -480,12 +494,6 @@ def name_of(component: Component) -> str:
     return type(component).__name__ if found is None else found.name
 
 
-def in_words(error: BaseException) -> str:
-    """Returns an error's type and the first line of its text."""
-    first = next(iter(str(error).splitlines()), "")
-    return f"{type(error).__name__}: {first}".rstrip(": ")
-
-
 def _try(found: Entry, component: Component, settings: BaseModel) -> None:
     """Holds a component to the first statements of its contract, once for each of its settings.
 
@@ -495,10 +503,10 @@ def _try(found: Entry, component: Component, settings: BaseModel) -> None:
         PluginError: it breaks its contract; names the distribution.
     """
     key = (found, settings.model_dump_json())
-    if not kind_of(found.kind).is_tried or key in _tried or not __debug__:
+    first = kind_of(found.kind).first
+    if not first or key in _tried or not __debug__:
         return
-    contract = _resolve("cfx.contracts:contract_for")(found.kind)
-    for _, sentence in _resolve("cfx.contracts:violations")(component, contract.first):
+    for _, sentence in violations(component, _resolve(first)):
         raise PluginError(f"{found} breaks its contract: {sentence}{_remedy(found)}")
     _tried.add(key)
 

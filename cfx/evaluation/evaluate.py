@@ -15,8 +15,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx.core import memory, registry
-from cfx.core.errors import OWN
+from cfx.core import memory
+from cfx.core.errors import OWN, in_words
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import CLUSTERS, StyleResult
@@ -302,7 +302,7 @@ class _Measures:
             except Exception as error:
                 if one.distribution == OWN:
                     raise
-                reason = registry.in_words(error)
+                reason = in_words(error)
                 self._left_out.append(leave_out(one.name, one.distribution, reason))
                 self._metrics.remove(one)
                 continue

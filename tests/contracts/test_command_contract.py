@@ -7,9 +7,9 @@ import argparse
 import pytest
 
 from cfx.app.commands.cite import CiteCommand
-from cfx.contracts import Check
-from cfx.contracts import commands as checks
 from cfx.core.command import Command
+from cfx.core.contract import Check
+from cfx_contracts import commands as checks
 
 
 class Silent(CiteCommand):

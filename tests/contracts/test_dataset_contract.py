@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cfx.contracts import datasets as checks
 from cfx.core.errors import PluginError
 from cfx.data.base import Dataset, DatasetSettings
 from cfx.data.pairs import Pair, PairSet
+from cfx_contracts import datasets as checks
 from tests.drives import straight_pairs
 
 

@@ -7,11 +7,12 @@ from typing import Any
 
 import pytest
 
-from cfx.contracts import Check, NotApplicable, check_contract
-from cfx.contracts import demos as checks
+from cfx.core.contract import Check, NotApplicable
 from cfx.core.errors import DataError
 from cfx.data.pairs import PairSet
 from cfx.evaluation.demo import PAGE, Demo
+from cfx_contracts import check_contract
+from cfx_contracts import demos as checks
 
 
 class Page(Demo):

@@ -10,10 +10,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.contracts import learners as checks
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import Scaler, measured_history, tokens
+from cfx_contracts import learners as checks
 
 EPOCHS = 12
 

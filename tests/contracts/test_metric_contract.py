@@ -6,10 +6,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.contracts import Check, NotApplicable
-from cfx.contracts import metrics as checks
+from cfx.core.contract import Check, NotApplicable
+from cfx.evaluation.metrics import contract as first
 from cfx.evaluation.metrics.base import Metric, Trajectories
 from cfx.evaluation.metrics.errors import MaeSpeed, RmseSpeed
+from cfx_contracts import metrics as checks
 
 
 class OfFrames(RmseSpeed):
@@ -60,8 +61,8 @@ class Careless(MaeSpeed):
 @pytest.mark.parametrize(
     ("check", "metric", "said"),
     [
-        (checks.a_metric_gives_one_number_for_each_pair, OfFrames, "a number for each pair"),
-        (checks.a_metric_gives_one_number_for_each_pair, Infinite, "is NaN, not infinite"),
+        (first.a_metric_gives_one_number_for_each_pair, OfFrames, "a number for each pair"),
+        (first.a_metric_gives_one_number_for_each_pair, Infinite, "is NaN, not infinite"),
         (checks.frames_that_do_not_count_do_not_matter, Unmasked, "the padding was not simulated"),
         (checks.a_batch_equals_the_loop_over_it, Relative, "the pairs that are measured beside it"),
         (checks.the_order_of_the_pairs_does_not_matter, Ranked, "its place among the others"),

@@ -10,12 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.contracts import models as checks
-from cfx.contracts import violations
 from cfx.core.component import Settings
+from cfx.core.contract import violations
 from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.models import contract as first
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss, KraussSettings
+from cfx_contracts import models as checks
 
 Step = Callable[..., Any]
 
@@ -120,7 +121,7 @@ class Declared(Moody):
 
 
 EXTREME = checks.speeds_are_finite_and_not_negative_at_every_extreme
-SHAPE = checks.keeps_shape_dtype_and_device
+SHAPE = first.keeps_shape_dtype_and_device
 BROKEN = {
     "NaN": (model(lambda v, f, *_: v / (f.speed - f.speed)), EXTREME, "negative or infinite speed"),
     "negative": (model(lambda v, *_: v - 1), EXTREME, "negative or infinite speed"),
@@ -128,12 +129,12 @@ BROKEN = {
     "dtype": (model(lambda v, *_: v.float()), SHAPE, "computes in the dtype"),
     "braking": (
         model(lambda v, *_: v - 30),
-        checks.steps_are_finite_and_never_negative,
+        first.steps_are_finite_and_never_negative,
         "must give finite speeds, not negative",
     ),
     "memory": (Forgetting(), SHAPE, "memory_size"),
-    "state": (Remembering(), checks.is_pure, "keeps no state"),
-    "in place": (Meddling(), checks.is_pure, "changes follower.speed in place"),
+    "state": (Remembering(), first.is_pure, "keeps no state"),
+    "in place": (Meddling(), first.is_pure, "changes follower.speed in place"),
     "mean": (
         model(lambda v, f, *_: v + 0.1 * f.speed.mean()),
         checks.a_batch_equals_the_loop_over_it,
@@ -187,12 +188,12 @@ BROKEN = {
     ),
     "unread": (
         Overgrown(),
-        checks.reads_the_parameters_that_it_declares,
+        first.reads_the_parameters_that_it_declares,
         "next_speed never reads mood",
     ),
     "undeclared": (
         model(lambda v, *args: v * args[-1]["mood"]),
-        checks.reads_the_parameters_that_it_declares,
+        first.reads_the_parameters_that_it_declares,
         "reads the parameter 'mood', which is not in its `parameters`",
     ),
     "no source": (Undocumented(), checks.every_parameter_says_what_it_is, "has no source"),

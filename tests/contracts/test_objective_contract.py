@@ -8,11 +8,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.calibration import contract as first
 from cfx.calibration.objectives import FrameValues, Objective, root_mean_square
 from cfx.calibration.rmse import SpeedRmse
 from cfx.calibration.theil_u import TheilU
-from cfx.contracts import check_contract
-from cfx.contracts import objectives as checks
+from cfx_contracts import check_contract
+from cfx_contracts import objectives as checks
 
 
 class Silent(SpeedRmse):
@@ -116,10 +117,10 @@ class Overwriting(SpeedRmse):
 
 
 BROKEN: dict[str, tuple[Objective, Any, str]] = {
-    "silent": (Silent(), checks.says_its_unit_and_its_signals, "says the unit"),
-    "blind": (Blind(), checks.says_its_unit_and_its_signals, "reads the speed or the gap"),
-    "secretive": (Secretive(), checks.reads_only_the_signals_it_names, "add what `terms` reads"),
-    "negative": (Negative(), checks.a_loss_is_finite_and_never_negative, "never negative"),
+    "silent": (Silent(), first.says_its_unit_and_its_signals, "says the unit"),
+    "blind": (Blind(), first.says_its_unit_and_its_signals, "reads the speed or the gap"),
+    "secretive": (Secretive(), first.reads_only_the_signals_it_names, "add what `terms` reads"),
+    "negative": (Negative(), first.a_loss_is_finite_and_never_negative, "never negative"),
     "centred": (Centred(), checks.a_perfect_simulation_has_the_lowest_loss, "a lower loss"),
     "relative": (Relative(), checks.a_standing_driver_has_a_finite_loss, "stand in a queue"),
     "heedless": (Heedless(), checks.frames_that_do_not_count_change_nothing, "anything finite"),
@@ -128,7 +129,7 @@ BROKEN: dict[str, tuple[Objective, Any, str]] = {
     "drifting": (Drifting(), checks.time_may_be_any_dimension, "which dimension is time"),
     "drifting in parts": (Drifting(), checks.parts_add_up_to_the_whole, "frame by frame"),
     "growing": (Growing(), checks.one_frame_needs_no_dimension_of_time, "as many tensors"),
-    "double": (Double(), checks.float32_agrees_with_float64, "computes in the dtype"),
+    "double": (Double(), first.float32_agrees_with_float64, "computes in the dtype"),
     "detached": (Detached(), checks.gradients_are_right, "Jacobian mismatch"),
     "vertical": (Vertical(), checks.the_slope_at_a_perfect_simulation_is_finite, "epsilon"),
     "overwriting": (Overwriting(), checks.what_it_is_given_stays_as_it_is, "in place"),

@@ -9,11 +9,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.calibration import contract as first
 from cfx.calibration.optimizers import CandidateLosses, Optimizer
 from cfx.calibration.random_search import RandomSearch
-from cfx.contracts import check_contract, violations
-from cfx.contracts import optimizers as checks
+from cfx.core.contract import violations
 from cfx.core.errors import PluginError
+from cfx_contracts import check_contract
+from cfx_contracts import optimizers as checks
 
 GOOD = RandomSearch(samples=4096)
 
@@ -181,7 +183,7 @@ BROKEN: dict[str, tuple[Optimizer, Any, str]] = {
     "twice": (Twice(), checks.evaluates_exactly_what_it_says, "not one more"),
     "overfilled": (
         Overfilled(),
-        checks.says_how_much_it_does_in_whole_numbers,
+        first.says_how_much_it_does_in_whole_numbers,
         "measured over the first of them",
     ),
     "frozen": (

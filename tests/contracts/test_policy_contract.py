@@ -9,9 +9,10 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from cfx.contracts import policies as checks
+from cfx.policies import contract as first
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.gru import GruPolicy
+from cfx_contracts import policies as checks
 
 Change = Callable[[nn.Module, Tensor], Tensor]
 
@@ -96,7 +97,7 @@ STREAMING = checks.streaming_equals_the_whole_sequence
 BROKEN: dict[str, tuple[Policy, Any, str]] = {
     "unbounded": (spoiled(lambda _, x: x), checks.outputs_lie_within_the_bounds, "outside the model's bounds"),
     "NaN": (spoiled(lambda _, x: x.log()), checks.outputs_lie_within_the_bounds, "outside the model's bounds"),
-    "one answer": (spoiled(lambda _, x: x[:, :, :1].sigmoid()), checks.answers_in_the_precision_of_a_job, r"must give \(networks, drivers, windows, parameters\)"),
+    "one answer": (spoiled(lambda _, x: x[:, :, :1].sigmoid()), first.answers_in_the_precision_of_a_job, r"must give \(networks, drivers, windows, parameters\)"),
     "restarting": (spoiled(lambda _, x: x.cumsum(2).sigmoid()), STREAMING, "both must give the same"),
     "mean": (spoiled(smeared), checks.a_policy_does_not_look_ahead, "later windows"),
     "mixing": (spoiled(lambda _, x: (x + x.mean(0)).sigmoid()), checks.networks_are_independent, "read only slice i"),

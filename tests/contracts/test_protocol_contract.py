@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.contracts import protocols as checks
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.within_driver import WithinDriver
 from cfx.evaluation.result import Evaluation, PairTrajectory
@@ -18,6 +17,7 @@ from cfx.learners.imitation import ImitationLearner
 from cfx.policies.base import Policy
 from cfx.policies.constant import FixedPolicy
 from cfx.simulation.windows import Split
+from cfx_contracts import protocols as checks
 
 
 class Retelling(WithinDriver):

@@ -9,13 +9,14 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.contracts import check_contract
-from cfx.contracts import simulators as checks
 from cfx.core.errors import ConfigError, SumoError
 from cfx.models.base import DrivingModel, Follower
 from cfx.models.krauss import Krauss
+from cfx.simulation import contract as first
 from cfx.simulation.base import Simulator, Stepper
 from cfx.simulation.rollout import MemorySimulator, MemoryStepper
+from cfx_contracts import check_contract
+from cfx_contracts import simulators as checks
 
 MakeStepper = Callable[[DrivingModel, float], Any]
 
@@ -154,19 +155,19 @@ BROKEN: dict[str, tuple[Simulator, Any, str]] = {
     "careless": (Careless(), checks.refuses_what_it_cannot_drive, "must raise a ConfigError"),
     "no stepper": (
         With(lambda model, dt: None),
-        checks.makes_a_stepper_for_the_model,
+        first.makes_a_stepper_for_the_model,
         "returns a NoneType and no Stepper",
     ),
     "another model": (
         With(lambda model, dt: MemoryStepper(Krauss(), dt)),
-        checks.makes_a_stepper_for_the_model,
+        first.makes_a_stepper_for_the_model,
         "must be the model it was made for",
     ),
-    "unlike": (With(Unlike), checks.makes_a_stepper_for_the_model, "must agree"),
+    "unlike": (With(Unlike), first.makes_a_stepper_for_the_model, "must agree"),
     "single": (With(Single), checks.keeps_shape_dtype_and_device, "computes in the dtype"),
     "single here": (
         With(Single),
-        checks.steps_in_this_process_keep_shape_and_dtype,
+        first.steps_in_this_process_keep_shape_and_dtype,
         "computes in the dtype",
     ),
     "wishful": (With(Wishful), checks.ends_where_the_last_step_led, "realised"),
@@ -179,7 +180,7 @@ BROKEN: dict[str, tuple[Simulator, Any, str]] = {
     "random": (With(Random), checks.the_same_again_gives_the_same, "to the last bit"),
     "overwriting": (With(Overwriting), checks.the_inputs_stay_as_they_are, "in place"),
     "closing": (With(Closing), checks.goes_on_after_it_was_closed, "start them again"),
-    "nameless": (With(Nameless), checks.says_what_results_depend_on, "one `identity`"),
+    "nameless": (With(Nameless), first.says_what_results_depend_on, "one `identity`"),
     "cutting": (With(Cutting), checks.gradients_are_as_claimed, "all gradients are 0"),
 }
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from cfx.contracts import check_contract
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx_contracts import check_contract
 from cfx_recordings.ngsim import NgsimDataset
 
 

@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from cfx.calibration.calibrator import Labels
-from cfx.contracts import check_contract
 from cfx.core.errors import DataError
 from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
@@ -23,6 +22,7 @@ from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, Windows, WindowSettings
+from cfx_contracts import check_contract
 from tests.drives import wavy_pairs
 from tests.learners.made import ready
 

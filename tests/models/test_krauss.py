@@ -9,10 +9,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from cfx.contracts import check_contract
-from cfx.contracts.models import keeps_its_equilibrium
 from cfx.models.base import Follower, Leader
 from cfx.models.krauss import Krauss
+from cfx_contracts import check_contract
+from cfx_contracts.models import keeps_its_equilibrium
 
 
 def number(value: float) -> Tensor:

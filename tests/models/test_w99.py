@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import cfx
-from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.models.base import Follower, Leader
 from cfx.models.w99 import W99
+from cfx_contracts import check_contract
 
 
 def test_contract_of_the_other_variant() -> None:

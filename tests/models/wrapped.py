@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cfx.contracts import models
+from cfx_contracts import models
 
 CHECKS = (
     models.every_parameter_says_what_it_is,

@@ -8,11 +8,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.contracts import policies as checks
 from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork
 from cfx.policies.core import Ensemble
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.offset import NONE
+from cfx_contracts import policies as checks
 
 
 class Three(GruPolicy):

@@ -15,7 +15,6 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.gradient_search import GradientSearch
 from cfx.calibration.shards import Solver
-from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
@@ -31,6 +30,7 @@ from cfx.policies.heads import head_class
 from cfx.policies.heads.base import DirectHead
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import WindowSettings
+from cfx_contracts import check_contract
 from cfx_estimators.estimator import EstimatorPolicy
 from cfx_estimators.particle_filter import ParticleFilterPolicy, reweighted
 from cfx_estimators.recalibrate import RecalibratePolicy

@@ -5,13 +5,13 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.contracts import check_contract
 from cfx.core.errors import ConfigError
 from cfx.policies.base import Policy
 from cfx.policies.features import INPUT_SETS, INPUTS, History, Scaler, token_width, tokens
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.policies.recurrent import RecurrentNetwork
+from cfx_contracts import check_contract
 
 
 @pytest.mark.parametrize("component", [GruPolicy, LstmPolicy])

@@ -5,10 +5,10 @@ import torch
 from botorch.models import SingleTaskGP
 
 import cfx
-from cfx.contracts.optimizers import Function, Problems, bowl, distance
 from cfx.core.errors import ConfigError
 from cfx_botorch import optimizer as botorch
 from cfx_botorch.optimizer import BotorchOptimizer
+from cfx_contracts.optimizers import Function, Problems, bowl, distance
 
 
 @pytest.mark.parametrize("function", [distance, pytest.param(bowl, marks=pytest.mark.slow)])

@@ -11,9 +11,9 @@ from scipy.optimize import brentq
 from torch import Tensor
 
 from cfx import Leader, Start
-from cfx.contracts.models import keeps_its_equilibrium
 from cfx.simulation.rollout import simulate
 from cfx_classics.gipps import Gipps
+from cfx_contracts.models import keeps_its_equilibrium
 
 from .steps import next_speed, number
 

@@ -12,11 +12,11 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Follower, Leader, Start
-from cfx.contracts.models import keeps_its_equilibrium
 from cfx.core.errors import ConfigError
 from cfx.simulation.rollout import simulate
 from cfx_classics.gipps import Gipps
 from cfx_classics.gipps_delay import GippsDelay
+from cfx_contracts.models import keeps_its_equilibrium
 
 from .steps import LENGTH, number
 

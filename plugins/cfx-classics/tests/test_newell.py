@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from cfx import Leader, Start
-from cfx.contracts.models import keeps_its_equilibrium
 from cfx.simulation.rollout import simulate
 from cfx_classics.newell import Newell
+from cfx_contracts.models import keeps_its_equilibrium
 
 from .steps import LENGTH, gain, next_speed, number
 

@@ -13,11 +13,11 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Leader, Start
-from cfx.contracts import check_contract
-from cfx.contracts.models import keeps_its_equilibrium
 from cfx.simulation.rollout import simulate
 from cfx_classics.fvdm import FVDM
 from cfx_classics.ovm import OVM
+from cfx_contracts import check_contract
+from cfx_contracts.models import keeps_its_equilibrium
 
 from .steps import LENGTH, gain, next_speed, number
 

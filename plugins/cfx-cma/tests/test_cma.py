@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import cfx
-from cfx.contracts import check_contract
-from cfx.contracts.optimizers import Problems
 from cfx.core.errors import ConfigError
 from cfx_cma.evolution import CmaOptimizer
+from cfx_contracts import check_contract
+from cfx_contracts.optimizers import Problems
 
 
 def test_contract_of_a_population_that_does_not_divide_the_budget() -> None:

@@ -18,8 +18,8 @@ from torch import Tensor
 
 import cfx
 from cfx import Follower, Leader, Start
-from cfx.contracts import check_contract
 from cfx.simulation.rollout import simulate
+from cfx_contracts import check_contract
 from cfx_idm.iidm import IIDM
 
 from .rollouts import order

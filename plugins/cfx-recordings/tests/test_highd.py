@@ -10,8 +10,8 @@ import pytest
 
 import cfx
 from cfx.app.cli import main
-from cfx.contracts import check_contract
 from cfx.core.errors import DataError
+from cfx_contracts import check_contract
 from cfx_recordings.highd import HighdDataset
 
 SIGNALS = [

@@ -8,9 +8,9 @@ import torch
 from scipy.optimize import differential_evolution
 
 import cfx
-from cfx.contracts import check_contract
-from cfx.contracts.optimizers import Problems
 from cfx.core.errors import ConfigError
+from cfx_contracts import check_contract
+from cfx_contracts.optimizers import Problems
 from cfx_scipy.differential_evolution import DifferentialEvolution
 
 

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from cfx.app.cli import main
-from cfx.contracts import check_contract
 from cfx.core.errors import DataError
+from cfx_contracts import check_contract
 from cfx_sumo.fcd import SumoFcdDataset
 from tests.data.layouts import made_pairs, write_fcd
 

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 import cfx
-from cfx.contracts import check_contract
+from cfx_contracts import check_contract
 from cfx_tcn.policy import TcnNetwork, TcnPolicy, TcnSettings
 
 

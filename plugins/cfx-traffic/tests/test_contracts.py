@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from cfx.contracts import check_contract
+from cfx_contracts import check_contract
 from cfx_traffic.protocol import TrafficProtocol
 from tests.evaluation.protocols.test_finished import drawn, job
 from tests.evaluation.protocols.test_transfer import HERE

@@ -16,9 +16,9 @@ from cfx.calibration.huber import SpeedHuber
 from cfx.calibration.mixed import Mixed
 from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.calibration.theil_u import TheilU
-from cfx.contracts import check_contract
 from cfx.core import registry
 from cfx.core.errors import OWN, ConfigError
+from cfx_contracts import check_contract
 
 SHIPPED = {
     "speed_rmse": SpeedRmse(),

@@ -10,9 +10,9 @@ from torch import Tensor
 
 from cfx.calibration.gradient_search import GradientSearch, _stages
 from cfx.calibration.random_search import RandomSearch
-from cfx.contracts import check_contract
-from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.core.errors import ConfigError
+from cfx_contracts import check_contract
+from cfx_contracts.optimizers import Problems, bowl, distance
 
 
 @pytest.mark.parametrize("options", [{}, {"samples": 300, "starts": 1, "screening": 0.1}])

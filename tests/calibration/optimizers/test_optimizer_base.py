@@ -5,8 +5,8 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.optimizers import TIE_ABSOLUTE, CandidateLosses, Optimizer
-from cfx.contracts.optimizers import Problems, distance
 from cfx.core.errors import PluginError
+from cfx_contracts.optimizers import Problems, distance
 
 
 class Listed(Optimizer):

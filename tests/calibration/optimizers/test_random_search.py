@@ -4,8 +4,8 @@ import pytest
 import torch
 
 from cfx.calibration.random_search import RandomSearch
-from cfx.contracts.optimizers import Problems, bowl, distance
 from cfx.core.errors import ConfigError
+from cfx_contracts.optimizers import Problems, bowl, distance
 
 
 def test_every_problem_sees_the_same_points() -> None:

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import pytest
 
 import cfx
-from cfx.contracts import check_contract
 from cfx.core import registry, threads
 from cfx.core.local_engine import LocalEngine
+from cfx_contracts import check_contract
 from cfx_dask.engine.engine import DaskEngine
 from tests.core.engine.clusters import running_cluster
 

@@ -18,7 +18,6 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.contracts import protocols
 from cfx.core.errors import DataError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.data.tidy import write_tidy
@@ -35,6 +34,7 @@ from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split, WindowSettings
+from cfx_contracts import protocols
 from tests.drives import straight_pairs, wavy_pairs
 
 QUICK = [

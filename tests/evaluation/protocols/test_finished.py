@@ -12,13 +12,13 @@ import torch
 import yaml
 
 import cfx
-from cfx.contracts import check_contract
 from cfx.core.errors import CfxError, DataError
 from cfx.data.pairs import PairBatch
 from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.forecasts import Origins
 from cfx.policies import checkpoint
 from cfx.simulation.rollout import MemoryStepper
+from cfx_contracts import check_contract
 from cfx_forecasts.protocol import Forecast
 from tests.drives import simulate_from_origins
 from tests.evaluation.protocols.test_transfer import HERE, ROLLOUT, elsewhere, trained

@@ -12,7 +12,6 @@ import torch
 import yaml
 
 import cfx
-from cfx.contracts import check_contract
 from cfx.core.errors import CfxError, DataError, TrackingError
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.tidy import TidyDataset, frame_of, write_tidy
@@ -22,6 +21,7 @@ from cfx.policies import checkpoint
 from cfx.policies.core import ALL
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
+from cfx_contracts import check_contract
 
 QUICK = [
     "debug=quick",

@@ -1,0 +1,202 @@
+"""`cfx plugins`: what is installed."""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, Any, cast, get_args, get_origin
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from pydantic_core import to_jsonable_python
+
+from cfx.app.completion import complete_with
+from cfx.core import registry
+from cfx.core.command import Command
+from cfx.core.console import blank_table, put
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+
+class PluginsCommand(Command):
+    """Shows, checks and writes components."""
+
+    summary = "installed components; show prints one (check and new: cfx-contracts)"
+
+    def parser(self) -> argparse.ArgumentParser:
+        made = argparse.ArgumentParser(
+            "cfx plugins",
+            description="Shows the installed components, without importing any. cfx plugins check"
+            " tries them and cfx plugins new writes a package of your own (cfx-contracts).",
+        )
+        actions = made.add_subparsers(dest="action")
+        show = actions.add_parser("show", help="a component's parameters, settings and reference")
+        about = f"{', '.join(registry.KINDS)} (data is a dataset too)"
+        complete_with(show.add_argument("kind", help=about), lambda _: registry.KINDS)
+        complete_with(
+            show.add_argument("name", help="one component"),
+            lambda options: registry.names(options.kind),
+        )
+        return made
+
+    def run(self, options: argparse.Namespace) -> int:
+        if options.action == "show":
+            show(options.kind, options.name)
+        else:
+            overview()
+        return 0
+
+
+def overview() -> None:
+    """Prints a row for every component. Imports none."""
+    rows = blank_table("kind", "name", "distribution", "version", "from", "state")
+    states = set()
+    for kind in registry.KINDS:
+        for entry in registry.entries(kind):
+            now = _state(entry)
+            states.add(now)
+            rows.add_row(kind, entry.name, entry.distribution, entry.version, entry.location, now)
+    put(rows)
+    if states & {"broken", "shadowed"}:
+        print("cfx plugins check says what is wrong, and what to do.")
+
+
+def _state(entry: registry.Entry) -> str:
+    """Returns what is known of a component without importing it."""
+    if registry.rivals(entry):
+        return "shadowed"
+    if registry.other_api(entry):
+        return "broken"
+    return "fine" if registry.is_loaded(entry) else "not loaded"
+
+
+def show(kind: str, name: str) -> None:
+    """Prints what a component is: where it comes from, what it does, its parameters and settings.
+
+    Raises:
+        PluginError: there is none of that name, or it cannot be loaded.
+    """
+    entry = registry.entry(kind, name)
+    cls: Any = registry.get(kind, name)
+    group = registry.kind_of(kind).group
+    print(f"{entry}\n{entry.location}\n{_use(entry, cls)}\n")
+    if cls.deprecated:
+        print(f"Deprecated: {cls.deprecated}\n")
+    print(f"{inspect.getdoc(cls) or '(its class has no docstring)'}\n")
+    reference = getattr(cls, "reference", "")
+    of_module = inspect.getdoc(inspect.getmodule(cls))
+    if reference:
+        print(f"Reference: {reference}\n")
+    elif of_module:
+        print(f"From its module: {of_module}\n")
+    if entry.kind == "objective":
+        print(f"Unit: {cls.unit or 'none'}\n")
+    about = {"model": _parameters, "metric": _metric, "table": _columns}.get(entry.kind)
+    if about is not None:
+        put(about(cls))
+    title = f"Settings (set with {group}.SETTING=VALUE)"
+    settings = blank_table("setting", "default", "values", "meaning", title=title)
+    settings.columns[0].no_wrap = True
+    for row in _settings(cls.schema):
+        if entry.kind != "model" or row[0] != "parameters":
+            settings.add_row(*row)
+    if settings.row_count:
+        put(settings)
+    else:
+        print("It has no settings.")
+
+
+def _use(entry: registry.Entry, cls: Any) -> str:
+    """Returns how a component comes into a job."""
+    name, group = entry.name, registry.kind_of(entry.kind).group
+    if entry.kind == "command":
+        return f"Run it with cfx {name}; cfx {name} --help says what it takes."
+    if entry.kind == "table":
+        return f"Every job that has rows of it writes {name}{cls.suffix}."
+    if entry.kind == "metric":
+        return f"Every job measures it; with {group}={name} no others but those that a job needs."
+    return f"Choose it with {group}={name}."
+
+
+def _metric(cls: Any) -> Table:
+    """Returns what tables say of a metric."""
+    rows = blank_table("heading", "unit", "better", "over pairs", "scopes", "meaning")
+    scopes = ", ".join(cls.scopes)
+    rows.add_row(cls.heading, cls.unit, cls.direction, cls.summary, scopes, cls.meaning)
+    return rows
+
+
+def _columns(cls: Any) -> Table:
+    """Returns the columns of a table of results."""
+    rows = blank_table("column", "unit", "type", "meaning", title="Columns")
+    rows.columns[0].no_wrap = True
+    for column in cls.columns:
+        rows.add_row(column.name, column.unit, column.dtype, column.meaning)
+    return rows
+
+
+def _parameters(cls: Any) -> Table:
+    """Returns a model's parameters as a table; sources stand below it, so that lines stay short."""
+    from rich.text import Text
+
+    headings = ("parameter", "unit", "low", "high", "default", "tuned", "meaning", "source")
+    rows = blank_table(*headings, title="Parameters")
+    rows.columns[0].no_wrap = True
+    sources = list(dict.fromkeys(p.source for p in cls.parameters if p.source))
+    for p in cls.parameters:
+        numbers = [f"{value:g}" for value in (p.low, p.high, p.default)]
+        tuned = "yes" if p.tuned else "constant"
+        if p.tuned and p.used_with is not None:
+            tuned = f"with {p.used_with[0]}={p.used_with[1]}"
+        mark = f"[{sources.index(p.source) + 1}]" if p.source else ""
+        rows.add_row(p.name, p.unit, *numbers, tuned, p.meaning, mark)
+    below = [f"[{number}] {source}" for number, source in enumerate(sources, start=1)]
+    below.append("Change one with model.parameters.NAME.{low,high,default,tuned}=VALUE")
+    rows.caption = Text("\n".join(below))
+    rows.caption_justify = "left"
+    return rows
+
+
+def _settings(schema: type[BaseModel], path: str = "") -> Iterator[tuple[str, str, str, str]]:
+    """Yields path, default, possible values and meaning of each setting."""
+    for name, field in schema.model_fields.items():
+        shown = "required"
+        if not field.is_required():
+            default = field.get_default(call_default_factory=True, validated_data={})
+            if isinstance(default, BaseModel):
+                yield from _settings(type(default), f"{path}{name}.")
+                continue
+            shown = json.dumps(to_jsonable_python(default))
+        meaning = field.description or ""
+        if field.deprecated:
+            meaning = f"{meaning} (deprecated: {field.deprecation_message})".strip()
+        yield f"{path}{name}", shown, _values(field), meaning
+
+
+def _values(field: FieldInfo) -> str:
+    """Returns the type and the bounds that a setting must keep."""
+    kind: Any = field.annotation
+    parts = [_type(kind)]
+    if type(None) in get_args(kind):
+        parts = [" or ".join(_type(one) for one in get_args(kind))]
+    for rule in field.metadata:
+        for key, sign in {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}.items():
+            if hasattr(rule, key):
+                parts.append(f"{sign} {getattr(rule, key)}")
+    return ", ".join(parts)
+
+
+def _type(kind: Any) -> str:
+    if kind is type(None):
+        return "null"
+    choices = get_args(kind)
+    if get_origin(kind) is dict:
+        return "mapping"
+    if choices and all(isinstance(choice, str) for choice in choices):
+        return "|".join(cast("tuple[str, ...]", choices))
+    if choices:
+        return str(kind).replace("typing.", "")
+    return str(getattr(kind, "__name__", kind))
