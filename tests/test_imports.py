@@ -25,7 +25,7 @@ FLOORS = (
     ("results",),
     ("figures",),
     ("app",),
-    ("api", "sklearn"),
+    ("api",),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 

@@ -165,7 +165,7 @@ _BROUGHT: dict[str, dict[str, tuple[str, ...]]] = {
         "demo": ("sumo",),
         "experiment": ("sumo_demo",),
         "export": ("sumo",),
-        "model": ("eidm", "sumo_vtype"),
+        "model": ("eidm", "idm_sumo", "krauss_sumo", "sumo_vtype"),
         "simulator": ("sumo",),
     },
     "cfx-tcn": {"policy": ("tcn",)},

@@ -26,8 +26,8 @@ import torch
 from torch import Tensor
 
 from cfx.models.base import Leader
-from cfx.models.krauss_sumo import KraussSumo
 from cfx.simulation.trajectory import Start
+from cfx_sumo.krauss import KraussSumo
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,

@@ -5,9 +5,9 @@ import torch
 
 from cfx.core.errors import ConfigError
 from cfx.models.krauss import Krauss
-from cfx.models.krauss_sumo import KraussSumo
 from cfx.models.vtype import sumo_speed
 from cfx.models.w99 import W99
+from cfx_sumo.krauss import KraussSumo
 
 
 def test_krauss_sumo_keeps_its_time_gap_behind_a_steady_leader() -> None:

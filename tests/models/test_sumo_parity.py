@@ -23,14 +23,14 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
-from cfx.models.idm_sumo import IdmSumo
 from cfx.models.krauss import Krauss
-from cfx.models.krauss_sumo import KraussSumo
 from cfx.models.vtype import InSumo, VType
 from cfx.models.w74 import W74
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start, Trajectory
+from cfx_sumo.idm import IdmSumo
+from cfx_sumo.krauss import KraussSumo
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,

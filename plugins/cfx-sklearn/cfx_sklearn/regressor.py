@@ -14,9 +14,9 @@ from sklearn.utils import Tags
 from sklearn.utils.validation import check_is_fitted
 from torch import Tensor
 
+from cfx import simulate
 from cfx.api.experiment import config
 from cfx.api.pairs import Pairs, read
-from cfx.api.simulation import simulate
 from cfx.app.job import steps
 from cfx.calibration.identifiability import losses_of
 from cfx.core.errors import DataError
@@ -51,7 +51,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
 
     Examples:
         >>> import cfx
-        >>> from cfx.sklearn import CarFollowingRegressor
+        >>> from cfx_sklearn import CarFollowingRegressor
         >>> from sklearn.model_selection import GridSearchCV, GroupKFold
         >>> table = cfx.read(dataset="synthetic", pairs=4, frames=120).frame
         >>> settings = {"optimizer": "random", "optimizer.samples": 64}
