@@ -20,11 +20,12 @@ pytest.importorskip("pythonfmu3", reason="needs PythonFMU3: pip install pythonfm
 STEPS = 60
 
 
-@pytest.fixture
-def unit(tmp_path: Path) -> Path:
-    save(adaptive({"name": "idm"}), tmp_path / "job" / "policy")
-    assert main(["export", str(tmp_path / "job"), "--to", "fmi"]) == 0
-    return tmp_path / "job" / "driver.fmu"
+@pytest.fixture(scope="module")
+def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("unit") / "job"
+    save(adaptive({"name": "idm"}), folder / "policy")
+    assert main(["export", str(folder), "--to", "fmi"]) == 0
+    return folder / "driver.fmu"
 
 
 def test_it_keeps_to_fmi_3_and_says_units(unit: Path) -> None:
