@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import os
-import subprocess
-import sys
+import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -15,8 +13,8 @@ import pytest
 from cfx.calibration.cache import Cache
 from cfx.core.component import content_key
 from cfx.core.errors import OutputError
+from tests.forks import Fork, Forks
 
-ROOT = Path(__file__).resolve().parents[2]
 PAIRS, GROUP = 24, 4
 
 WORKER = f"""
@@ -62,27 +60,32 @@ print(fixed.tolist())
 """
 
 
-def start(here: Path, seconds: float) -> subprocess.Popen[str]:
-    script = here / "worker.py"  # a file: the key of an entry holds the optimizer's source
+@pytest.fixture(scope="module")
+def forks(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Forks]:
+    imports = "import cfx.calibration.calibrator, cfx.calibration.random_search, tests.drives"
+    with Forks(imports, tmp_path_factory.mktemp("workers")) as started:
+        yield started
+
+
+@pytest.fixture
+def start(forks: Forks, tmp_path: Path) -> Callable[[float], Fork]:
+    """Returns a function that starts a worker, whose optimizer waits for so many seconds."""
+    script = tmp_path / "worker.py"  # a file: the key of an entry holds the optimizer's source
     script.write_text(WORKER)
-    environment = {**os.environ, "PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1"}
-    command = [sys.executable, str(script), str(here), str(seconds)]
-    return subprocess.Popen(
-        command, env=environment, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    )
+    return lambda seconds: forks.start([str(script), str(tmp_path), str(seconds)], tmp_path)
 
 
-def release(here: Path, *workers: subprocess.Popen[str]) -> None:
+def release(here: Path, *workers: Fork) -> None:
     """Lets the workers begin together."""
     until(lambda: len(list(here.glob("ready-*"))) == len(workers), *workers)
     (here / "go").touch()
 
 
-def until(what: Callable[[], bool], *workers: subprocess.Popen[str]) -> None:
+def until(what: Callable[[], bool], *workers: Fork) -> None:
     """Waits for something while the workers live."""
     while not what():
         for worker in workers:
-            assert worker.poll() is None, worker.communicate()
+            assert worker.poll() is None, worker.error.read_text()
         time.sleep(0.01)
 
 
@@ -96,33 +99,37 @@ def solved(here: Path) -> dict[int, int]:
     return counts
 
 
-def test_two_processes_share_one_calibration_and_solve_each_problem_once(tmp_path: Path) -> None:
-    workers = [start(tmp_path, 0.2) for _ in range(2)]
+def test_two_processes_share_one_calibration_and_solve_each_problem_once(
+    tmp_path: Path, start: Callable[[float], Fork]
+) -> None:
+    workers = [start(0.2) for _ in range(2)]
     release(tmp_path, *workers)
-    outputs = [worker.communicate(timeout=120) for worker in workers]
-    assert [worker.returncode for worker in workers] == [0, 0], outputs
+    codes = [worker.wait() for worker in workers]
+    assert codes == [0, 0], [worker.error.read_text() for worker in workers]
+    outputs = [worker.out.read_text() for worker in workers]
     counts = solved(tmp_path)
     assert sum(counts.values()) == PAIRS
     assert set(counts) == {worker.pid for worker in workers}  # neither only waited
-    assert outputs[0][0] == outputs[1][0]
-    assert len(json.loads(outputs[0][0])) == PAIRS
+    assert outputs[0] == outputs[1]
+    assert len(json.loads(outputs[0])) == PAIRS
     assert len(list((tmp_path / "cache").rglob("*.entry"))) == PAIRS
 
 
-def test_a_process_that_is_killed_with_its_claims_blocks_nobody(tmp_path: Path) -> None:
-    stuck = start(tmp_path, 600)
+def test_a_process_that_is_killed_with_its_claims_blocks_nobody(
+    tmp_path: Path, start: Callable[[float], Fork]
+) -> None:
+    stuck = start(600)
     release(tmp_path, stuck)
     until(lambda: bool(solved(tmp_path)), stuck)
-    other = start(tmp_path, 0)
+    other = start(0)
     until(
         lambda: sum(solved(tmp_path).values()) == PAIRS, stuck, other
     )  # all but what the first has claimed, and that
     assert other.poll() is None  # it waits for the claimed ones, and does not compute them again
     stuck.kill()
-    stuck.communicate()
-    out, error = other.communicate(timeout=120)
-    assert other.returncode == 0, error
-    assert len(json.loads(out)) == PAIRS
+    assert stuck.wait() == -signal.SIGKILL
+    assert other.wait() == 0, other.error.read_text()
+    assert len(json.loads(other.out.read_text())) == PAIRS
     counts = solved(tmp_path)
     assert counts[other.pid] == PAIRS
     assert counts[stuck.pid] <= GROUP

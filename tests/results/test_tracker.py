@@ -40,6 +40,7 @@ from cfx.simulation.windows import WindowSettings
 from cfx_mlflow.store import download_run, quiet, translate_errors
 from cfx_mlflow.tracker import CURVE_POINTS, MlflowTracker, sweep_link
 from tests.drives import wavy_pairs
+from tests.forks import Forks
 from tests.made_up import MadeUp, make_curves, make_results
 
 NODE = {
@@ -318,7 +319,8 @@ def test_a_run_whose_process_is_gone_is_closed(uri: str, client: Any) -> None:
 
 
 JOB = """
-import sys
+import sys, warnings
+warnings.simplefilter("error")
 from cfx_mlflow.tracker import MlflowTracker
 uri, seed = sys.argv[1:]
 sweep = "a sweep'of/many"
@@ -330,17 +332,13 @@ with MlflowTracker.run(uri, run_name=f"job {seed}", parameters={"seed": seed}, s
 def test_two_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
     """They make the database, the experiment and one parent between them."""
     uri = f"sqlite:///{tmp_path}/new/deeper/mlflow.db"
-    jobs = [
-        subprocess.Popen(
-            [sys.executable, "-W", "error", "-c", JOB, uri, str(k)],
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-        )
-        for k in range(2)
-    ]
-    said = [job.communicate(timeout=200)[0] for job in jobs]
-    assert [job.returncode for job in jobs] == [0] * 2, said
+    (tmp_path / "forks").mkdir()
+    # Connections are made by each process: the one they come from only imports.
+    with Forks("import mlflow, cfx_mlflow.tracker", tmp_path / "forks") as forks:
+        jobs = [forks.start(["-c", JOB, uri, str(k)], tmp_path) for k in range(2)]
+        codes = [job.wait() for job in jobs]
+    said = [job.out.read_text() + job.error.read_text() for job in jobs]
+    assert codes == [0] * 2, said
     assert said == [""] * 2
     with quiet():
         from mlflow import MlflowClient

@@ -3,7 +3,6 @@ from __future__ import annotations
 import csv
 import json
 import logging
-import subprocess
 import sys
 import textwrap
 from pathlib import Path
@@ -17,6 +16,7 @@ from cfx.policies.checkpoint import save
 from cfx_sumo.demo.motorway import SHIPPED
 from cfx_sumo.drive.run import Collision, ScenarioRun, Tally, parse_drivers, report
 from tests.agents import adaptive
+from tests.forks import Forks
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 
@@ -55,40 +55,17 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def python(script: str, folder: Path) -> Any:
+def python(live: Forks, script: str, folder: Path) -> Any:
     """Runs a script in a process of its own; returns the JSON of its last line."""
-    done = subprocess.run(
-        [sys.executable, "-c", textwrap.dedent(script)],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=200,
-    )
+    done = live.run(["-c", textwrap.dedent(script)], folder)
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def test_the_command_drives_a_scenario_and_says_what_happened(scenario: Path) -> None:
-    command = [
-        sys.executable,
-        "-m",
-        "cfx",
-        "drive",
-        "motorway.sumocfg",
-        "--drivers",
-        "calm=calm",
-        "hasty=hasty",
-        "--seed",
-        "7",
-    ]
-    done = subprocess.run(
-        [*command, "--output", "out/drives.csv", "--", "--collision.action", "warn"],
-        cwd=scenario,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+def test_the_command_drives_a_scenario_and_says_what_happened(scenario: Path, live: Forks) -> None:
+    command = ["-m", "cfx", "drive", "motorway.sumocfg", "--drivers", "calm=calm", "hasty=hasty"]
+    command += ["--seed", "7", "--output", "out/drives.csv", "--", "--collision.action", "warn"]
+    done = live.run(command, scenario)
     assert done.returncode == 0, done.stderr
     table = {
         line.split()[0]: line.split()
@@ -111,8 +88,11 @@ def test_the_command_drives_a_scenario_and_says_what_happened(scenario: Path) ->
     assert not [row for row in rows if row["type"] == "calm" and row["parameter_cc1"]]
 
 
-def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(scenario: Path) -> None:
+def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(
+    scenario: Path, live: Forks
+) -> None:
     said = python(
+        live,
         """
         import sys
         sys.modules["pyarrow"] = None
@@ -179,7 +159,7 @@ def _not_found(name: str) -> str:
     raise PackageNotFoundError(name)
 
 
-def test_a_distribution_is_driven_and_far_positions_are_exact(scenario: Path) -> None:
+def test_a_distribution_is_driven_and_far_positions_are_exact(scenario: Path, live: Forks) -> None:
     """And a simulation that the caller has open is left alone, as is the environment."""
     demand = DEMAND.replace(
         "</routes>",
@@ -197,6 +177,7 @@ def test_a_distribution_is_driven_and_far_positions_are_exact(scenario: Path) ->
         text.replace(str(scenario / "demand.rou.xml"), "mixed.rou.xml")
     )
     found = python(
+        live,
         """
         import sys
         sys.modules["pyarrow"] = None
@@ -246,10 +227,11 @@ def test_a_distribution_is_driven_and_far_positions_are_exact(scenario: Path) ->
 
 
 def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_nothing(
-    scenario: Path,
+    scenario: Path, live: Forks
 ) -> None:
     """One drives into a car that stands, one is told to change lanes."""
     counts = python(
+        live,
         """
         import sys
         sys.modules["pyarrow"] = None

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 from xml.etree import ElementTree
 
 import pytest
+
+from tests.forks import Forks
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 
@@ -41,15 +41,8 @@ libsumo.close()
 """
 
 
-def python(folder: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, *arguments],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=280,
-    )
+def python(live: Forks, folder: Path, *arguments: str) -> str:
+    done = live.run(arguments, folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -91,18 +84,17 @@ def red_lights_run(folder: Path) -> list[tuple[float, str]]:
     "way", [pytest.param("a program of one's own", marks=pytest.mark.slow), "cfx drive"]
 )
 def test_by_default_nobody_runs_a_red_light_passes_a_stop_or_collides(
-    way: str, tmp_path: Path
+    way: str, tmp_path: Path, live: Forks
 ) -> None:
     """`cfx drive` drives by `Fleet.load`."""
     (tmp_path / "town.sumocfg").write_text(CONFIGURATION)
     if way == "cfx drive":
-        said = python(
-            tmp_path, "-m", "cfx", "drive", "town.sumocfg", "--drivers", "car=cfx://i80-idm"
-        )
+        command = ["-m", "cfx", "drive", "town.sumocfg", "--drivers", "car=cfx://i80-idm"]
+        said = python(live, tmp_path, *command)
         row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
         assert row[5:8] == ["0", "0", "0"], "contact, below minGap, teleports"
     else:
-        python(tmp_path, "-c", OWN_PROGRAM.replace("END", str(END_S)))
+        python(live, tmp_path, "-c", OWN_PROGRAM.replace("END", str(END_S)))
     assert red_lights_run(tmp_path) == []
     assert "<collision " not in (tmp_path / "collisions.xml").read_text()
     at_stop = [
@@ -163,9 +155,11 @@ print(json.dumps([tally.collisions, tally.below_min_gap,
 
 
 @pytest.mark.parametrize("action", ["teleport", "remove", "warn"])
-def test_contact_is_told_apart_from_a_gap_below_min_gap(action: str, tmp_path: Path) -> None:
+def test_contact_is_told_apart_from_a_gap_below_min_gap(
+    action: str, tmp_path: Path, live: Forks
+) -> None:
     """SUMO reports both as collisions; whatever it then does with the vehicles."""
-    said = python(tmp_path, "-c", CLOSE.replace("ACTION", f'"{action}"'))
+    said = python(live, tmp_path, "-c", CLOSE.replace("ACTION", f'"{action}"'))
     contacts, below, collisions = json.loads(said.splitlines()[-1])
     assert (contacts, below) == (1, 1)
     who = {one[0]: one for one in collisions}

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -13,6 +11,7 @@ from cfx.core.errors import DataError, OutputError
 from cfx_sumo.live.driver import Driver
 from cfx_sumo.live.fleet import Fleet
 from tests.agents import adaptive
+from tests.forks import Forks
 from tests.sumo.test_driver import Road, platoon
 
 pytest.importorskip("traci", reason="needs the extra sumo")
@@ -66,15 +65,10 @@ print(json.dumps([expected, same, another]))
 """
 
 
-def test_a_simulation_that_goes_on_from_a_saved_state_is_the_same(tmp_path: Path) -> None:
-    done = subprocess.run(
-        [sys.executable, "-c", SAVE_AND_GO_ON],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=280,
-    )
+def test_a_simulation_that_goes_on_from_a_saved_state_is_the_same(
+    tmp_path: Path, live: Forks
+) -> None:
+    done = live.run(["-c", SAVE_AND_GO_ON], tmp_path)
     assert done.returncode == 0, done.stderr
     expected, same, another = json.loads(done.stdout.splitlines()[-1])
     assert len(expected) > 22 * 127

@@ -12,25 +12,23 @@ import pytest
 
 from cfx_sumo.drive.queue import QueueAtLight
 from cfx_sumo.drive.run import Histogram
+from tests.forks import Forks
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 
 
-def drive(folder: Path, *arguments: str) -> str:
-    done = subprocess.run(
-        [sys.executable, "-m", "cfx", "drive", *arguments],
-        cwd=folder,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=280,
-    )
+def drive(live: Forks, folder: Path, *arguments: str) -> str:
+    done = live.run(["-m", "cfx", "drive", *arguments], folder)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
 def test_drive_needs_no_arguments(tmp_path: Path) -> None:
-    said = drive(tmp_path, "--end", "20")
+    """Nor anybody who keeps pyarrow away from libsumo: the command does."""
+    command = [sys.executable, "-m", "cfx", "drive", "--end", "20"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    said = done.stdout
     assert "200 steps of 0.1 s" in said
     assert "at most 22 of these vehicles at once" in said
     row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
@@ -40,39 +38,40 @@ def test_drive_needs_no_arguments(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_motorway_has_waves_and_lane_changes(tmp_path: Path) -> None:
-    said = drive(tmp_path, "motorway", "--drivers", "car=cfx://i80-krauss", "--end", "60")
+def test_the_motorway_has_waves_and_lane_changes(tmp_path: Path, live: Forks) -> None:
+    said = drive(live, tmp_path, "motorway", "--drivers", "car=cfx://i80-krauss", "--end", "60")
     row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
     assert int(row[1]) > 50
     assert int(row[4]) > 10  # lane changes
     assert row[5] == "0"  # collisions
 
 
-def town(folder: Path, policy: str, end: int, step: float) -> None:
-    said = drive(
-        folder, "town", "--drivers", f"car={policy}", "--end", str(end), "--step", str(step)
-    )
+def town(live: Forks, folder: Path, policy: str, end: int, step: float) -> None:
+    command = ["town", "--drivers", f"car={policy}", "--end", str(end), "--step", str(step)]
+    said = drive(live, folder, *command)
     row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
     assert int(row[1]) > 0.5 * end
     assert row[5:8] == ["0", "0", "0"]  # contact, gaps below minGap, teleports
 
 
-def test_the_town_has_no_collisions(tmp_path: Path) -> None:
+def test_the_town_has_no_collisions(tmp_path: Path, live: Forks) -> None:
     """At lights, where left turns give way, and at the roundabout; with SUMO's checks."""
-    town(tmp_path, "cfx://i80-w99", 100, 0.5)
+    town(live, tmp_path, "cfx://i80-w99", 100, 0.5)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("policy", ["cfx://i80-w99", "cfx://idm"])
 @pytest.mark.parametrize("step", [0.05, 0.1, 0.5, 1.0])
-def test_the_town_has_no_collisions_at_any_step(policy: str, step: float, tmp_path: Path) -> None:
-    town(tmp_path, policy, 200, step)
+def test_the_town_has_no_collisions_at_any_step(
+    policy: str, step: float, tmp_path: Path, live: Forks
+) -> None:
+    town(live, tmp_path, policy, 200, step)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("step", [0.05, 0.1, 0.5, 1.0])
 def test_stress_finds_no_collision_and_no_step_outside_the_limits(
-    step: float, tmp_path: Path
+    step: float, tmp_path: Path, live: Forks
 ) -> None:
     """A few events of each kind; the cards hold those of a thousand."""
     script = f"""
@@ -83,9 +82,7 @@ from cfx_sumo.drive.stress import run_stress
 result = run_stress({{"car": "cfx://i80-idm"}}, seed=3, cut_ins=30, step={step})
 print(json.dumps(result.to_json()))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=1800
-    )
+    done = live.run(["-c", script], tmp_path)
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
     events, town = found["events"], found["town"]

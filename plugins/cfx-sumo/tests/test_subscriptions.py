@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 
 from cfx.simulation.kernel.compiler import find_compiler
+from tests.forks import Forks
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 
@@ -58,16 +57,11 @@ print(json.dumps([found, said, bridge is not None]))
 """
 
 
-def test_subscriptions_and_the_compiled_call_say_what_calls_say(tmp_path: Path) -> None:
+def test_subscriptions_and_the_compiled_call_say_what_calls_say(
+    tmp_path: Path, live: Forks
+) -> None:
     """In libsumo, which has both, while vehicles come and change lanes."""
-    done = subprocess.run(
-        [sys.executable, "-c", BOTH_WAYS],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=280,
-    )
+    done = live.run(["-c", BOTH_WAYS], tmp_path)
     assert done.returncode == 0, done.stderr
     found, said, is_compiled = json.loads(done.stdout.splitlines()[-1])
     assert all(same for same, _, _ in found)
