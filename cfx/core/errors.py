@@ -123,7 +123,7 @@ def listed(values: Iterable[object], limit: int = 12) -> str:
 _BROUGHT: dict[str, dict[str, tuple[str, ...]]] = {
     "cfx-benchmark": {"command": ("benchmark", "policies.make")},
     "cfx-botorch": {"optimizer": ("botorch",)},
-    "cfx-classics": {"model": ("fvdm", "gipps", "gipps_delay", "newell", "ovm", "ovm_city")},
+    "cfx-classics": {"model": ("fvdm", "gipps", "gipps_delay", "newell", "ovm", "ovm_city", "w74")},
     "cfx-cma": {"optimizer": ("cma",)},
     "cfx-contracts": {"command": ("plugins.check", "plugins.new")},
     "cfx-dask": {"engine": ("dask",), "hydra/launcher": ("dask",)},

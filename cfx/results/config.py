@@ -107,15 +107,9 @@ _CONSTANT = ("fixed", "default")
 """Policies of cfx that keep parameters constant: such a job is a calibration."""
 
 
-class JobConfig(Settings):
-    """Everything that one job needs to know; `conf/config.yaml` says the same in YAML.
+class JobParts(Settings):
+    """The components that a job is made of, each by its node."""
 
-    A field is a key or a group of the command line, so that there are as many fields as these.
-    """
-
-    preset: str | None = Field(
-        None, description="the experiment that these settings come from; a report reads it"
-    )
     data: Node = Field(description="the dataset's node")
     model: Node = Field(description="the driving model's node")
     policy: Node = Field(description="the policy's node")
@@ -125,9 +119,24 @@ class JobConfig(Settings):
     protocol: Node = Field(description="the protocol's node")
     simulator: Node = Field({"name": "memory"}, description="the simulator's node")
     engine: Node = Field({"name": "local"}, description="the engine's node")
+    demo: Node | None = Field(None, description="the demonstration's node; null: there is none")
     metrics: Literal["all"] | tuple[str, ...] = Field(
         "all", description="what is measured: all that are installed, or some by name"
     )
+
+    @field_validator("metrics", mode="before")
+    @classmethod
+    def _several(cls, metrics: Any) -> Any:
+        if isinstance(metrics, str) and metrics != "all":
+            metrics = (metrics,)
+        if not metrics or not isinstance(metrics, str | list | tuple):
+            raise ValueError("write all, or a list of names such as [rmse_speed, rmse_gap]")
+        return metrics if isinstance(metrics, str) else each_once(metrics)
+
+
+class JobResources(Settings):
+    """What a job computes with."""
+
     seed: int = Field(0, ge=0, lt=2**32, description="seed of everything random")
     device: str = Field("auto", description="auto, cpu, cuda or cuda:N")
     dtype: Literal["float32", "float64"] = Field("float64", description="precision of simulations")
@@ -137,6 +146,35 @@ class JobConfig(Settings):
         description="cores that calibration and training share their work among; null: all",
     )
     threads: int | None = Field(1, ge=1, description="torch's threads; null: torch's own choice")
+    cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
+
+    @field_validator("device")
+    @classmethod
+    def _known(cls, device: str) -> str:
+        if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", device):
+            raise ValueError("choose auto, cpu, cuda or cuda:N")
+        return device
+
+
+class JobRecords(Settings):
+    """Where a job's results go."""
+
+    output: OutputSettings = Field(OutputSettings(), description="where results go")
+    tracking: TrackingSettings = Field(TrackingSettings(), description="where jobs are tracked")
+    figures: FigureSettings = Field(FigureSettings(), description="figures")
+    failed_value: Annotated[float, Field(ge=float("-inf"), allow_inf_nan=True)] | None = Field(
+        None,
+        description="what a sweeper that optimises is told if this job fails, such as inf; null:"
+        " that it failed",
+    )
+
+
+class JobConfig(JobParts, JobResources, JobRecords):
+    """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
+
+    preset: str | None = Field(
+        None, description="the experiment that these settings come from; a report reads it"
+    )
     split: float = Field(
         0.8,
         gt=0,
@@ -149,32 +187,6 @@ class JobConfig(Settings):
         CalibrationSettings(), description="how constant parameters are calibrated"
     )
     style: StyleSettings = Field(StyleSettings(), description="driving style")
-    cache: CacheSettings = Field(CacheSettings(), description="cache of calibrations")
-    output: OutputSettings = Field(OutputSettings(), description="where results go")
-    tracking: TrackingSettings = Field(TrackingSettings(), description="where jobs are tracked")
-    failed_value: Annotated[float, Field(ge=float("-inf"), allow_inf_nan=True)] | None = Field(
-        None,
-        description="what a sweeper that optimises is told if this job fails, such as inf; null:"
-        " that it failed",
-    )
-    figures: FigureSettings = Field(FigureSettings(), description="figures")
-    demo: Node | None = Field(None, description="the demonstration's node; null: there is none")
-
-    @field_validator("device")
-    @classmethod
-    def _known(cls, device: str) -> str:
-        if not re.fullmatch(r"auto|cpu|cuda(:\d+)?", device):
-            raise ValueError("choose auto, cpu, cuda or cuda:N")
-        return device
-
-    @field_validator("metrics", mode="before")
-    @classmethod
-    def _several(cls, metrics: Any) -> Any:
-        if isinstance(metrics, str) and metrics != "all":
-            metrics = (metrics,)
-        if not metrics or not isinstance(metrics, str | list | tuple):
-            raise ValueError("write all, or a list of names such as [rmse_speed, rmse_gap]")
-        return metrics if isinstance(metrics, str) else each_once(metrics)
 
     @property
     def is_calibration(self) -> bool:

@@ -25,10 +25,10 @@ from torch import Tensor
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.krauss import Krauss
 from cfx.models.vtype import InSumo, VType
-from cfx.models.w74 import W74
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start, Trajectory
+from cfx_classics.w74 import W74
 from cfx_sumo.idm import IdmSumo
 from cfx_sumo.krauss import KraussSumo
 

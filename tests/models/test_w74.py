@@ -5,9 +5,9 @@ import torch
 from torch import Tensor
 
 from cfx.models.base import Follower, Leader
-from cfx.models.w74 import W74
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start
+from cfx_classics.w74 import W74
 
 L, V = 5.0, 10.0
 AX, ABX = L + 2.0, L + 2.0 + 3.5 * V**0.5

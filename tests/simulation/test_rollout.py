@@ -13,11 +13,11 @@ from cfx.core.errors import ParameterError
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
-from cfx.models.w74 import W74
 from cfx.models.w99 import W99
 from cfx.simulation import rollout
 from cfx.simulation.rollout import MemoryStepper, can_compile, simulate
 from cfx.simulation.trajectory import Start, Trajectory
+from cfx_classics.w74 import W74
 
 DT = 0.1
 MODELS = [Krauss(), W99(), W74()]
