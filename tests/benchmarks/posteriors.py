@@ -1,4 +1,4 @@
-"""What docs/how-to/uncertainty.md says of `calibration.posterior`: coverage, ranks, I-80, time.
+"""What docs/how-to/uncertainty.md says of `calibration.posterior`: coverage, I-80, time; ranks too.
 
 python -m tests.benchmarks.posteriors coverage|recording|forecasts|chains|nuts|covered krauss|idm|w99
 python -m tests.benchmarks.posteriors learned|beside krauss|idm|w99

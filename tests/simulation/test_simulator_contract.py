@@ -95,7 +95,7 @@ def test_a_third_partys_simulator_takes_the_steps_of_a_job(
         ("None", "stepper returns a NoneType and no Stepper"),
         ("Unnamed(model, dt)", r"identity\(\) must give a text"),
         ("Single(model, dt)", r"advance's positions gives torch.float32"),
-        ("Short(model, dt)", r"advance's positions gives the shape \(19, 9\)"),
+        ("Short(model, dt)", r"advance's positions gives the shape \(4, 64\)"),
     ],
 )
 def test_a_broken_simulator_is_found_before_any_work(
