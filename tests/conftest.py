@@ -136,6 +136,14 @@ def _choices_where_they_are_read() -> Iterator[None]:
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _scores_without_compiling() -> None:
+    """Hides Numba from `scoringrules`, which compiles for two seconds what cfx never calls."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(sys.modules, "numba", None)
+        importlib.import_module("scoringrules")
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _migrated_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Lets MLflow run its migrations once a session, and not for 1 s of each new database."""
     migrated = tmp_path_factory.mktemp("store") / "migrated.db"

@@ -10,6 +10,7 @@ from typing import Any
 import pandas as pd
 import pytest
 import yaml
+from matplotlib.figure import Figure
 
 import cfx
 from cfx.app import cli, hydra_source, nodes
@@ -90,6 +91,7 @@ def test_one_pair_has_its_table_and_its_speed_plots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.touch())
     few = ["data.frames=120", "tracking.enabled=false", "figures.enabled=true"]
     result = cfx.run(["experiment=paper/pair", *SMALL, *few])
     assert result.pairs.method.tolist() == ["default", "fixed", "policy"]

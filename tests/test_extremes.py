@@ -60,8 +60,8 @@ RECORDINGS = {
     "60 m/s": [
         follower(f"p{i}", 300, lambda t, i=i: 60 + 4 * np.sin(t / (3 + i)), 60.0) for i in range(3)
     ],
-    "gaps of 1 cm": [follower(f"p{i}", 300, lambda t: 1 + 0 * t, 0.01) for i in range(3)],
-    "an hour": [follower("p", 7_200, lambda t: 15 + 6 * np.sin(t / 7), 30.0, dt=0.5)],
+    "gaps of 1 cm": [follower(f"p{i}", 150, lambda t: 1 + 0 * t, 0.01) for i in range(3)],
+    "an hour": [follower("p", 3_600, lambda t: 15 + 6 * np.sin(t / 7), 30.0, dt=1.0)],
     "an hour in steps of 0.1 s": [follower("p", 36_000, lambda t: 15 + 6 * np.sin(t / 7), 30.0)],
     "one window": [
         follower(f"p{i}", 27, lambda t, i=i: 10 + 2 * np.sin(t / (3 + i)), 20.0) for i in range(2)

@@ -15,9 +15,13 @@ import cfx
 from cfx.core.errors import ConfigError, DataError
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 64}
+"""How to calibrate for a test; policies that were saved say themselves how drivers are calibrated."""
 SMALL = {
     **RANDOM,
+    "calibration.prior": "none",
     "learner.epochs": 1,
+    "learner.steps": 3,
+    "learner.horizon": 6,
     "policy.hidden_size": 4,
     "protocol.folds": 2,
     "learner.ensemble_size": 1,

@@ -338,7 +338,7 @@ class Elsewhere(Engine):
     [
         RandomSearch(samples=512),
         GradientSearch(),
-        BotorchOptimizer(screening=32, initial=6, iterations=3),
+        BotorchOptimizer(screening=16, initial=4, iterations=1),
     ],
     ids=["random", "gradient", "botorch"],
 )

@@ -39,8 +39,8 @@ MODULES = (
 """Whoever writes files."""
 
 WHOLE = cfx.core.files.atomic_write
-STRIDE = int(os.environ.get("CFX_FAULTS_STRIDE", "99"))
-"""Of the faults every so manieth is tried; `make fuzz` tries all."""
+STRIDE = int(os.environ.get("CFX_FAULTS_STRIDE", "161"))
+"""Of the faults every so manieth is tried, of another kind at another moment; `make fuzz` tries all."""
 
 KINDS = ("ENOSPC", "EIO", "EACCES", "killed")
 MOMENTS = ("before", "unnamed", "named")

@@ -179,10 +179,11 @@ def test_a_learner_that_needs_gradients_is_refused_before_any_work(tmp_path: Pat
     with pytest.raises(ConfigError, match="needs gradients, and the simulator has none"):
         cfx.run(
             [
+                *QUICK[3:],
+                "policy=gru",
                 "simulator=sumo",
                 "model=krauss_sumo",
                 "learner=rollout",
-                "tracking.enabled=false",
                 f"hydra.run.dir={tmp_path}",
             ]
         )

@@ -111,8 +111,8 @@ def test_a_job_trains_it_and_what_is_saved_drives_the_same(
     quick = [
         "debug=quick",
         "policy.inputs=[leader_speed,follower_speed]",
-        "data.frames=300",
-        "learner.epochs=15",
+        "data.frames=200",
+        "learner.epochs=6",
         "tracking.enabled=false",
         "figures.enabled=false",
     ]

@@ -131,6 +131,7 @@ def test_a_stochastic_policy_drives_at_its_centre_and_sampled(
 def test_estimators_drive_too(policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.chdir(tmp_path)
     short = ["protocol.duration=12", "protocol.settle=1", "model=idm", "protocol.noise=[2,0.2]"]
+    short += ["protocol.densities=[60]", "protocol.repetitions=1", "calibration.prior=none"]
     result = cfx.run([*TRAFFIC, *policy.split(), *short])
     assert np.isfinite(result.metrics["traffic/capacity/policy"])
 

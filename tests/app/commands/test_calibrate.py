@@ -18,6 +18,7 @@ QUICK = [
     "data.min_frames=100",
     "optimizer=random",
     "optimizer.samples=16",
+    "calibration.prior=none",
     "tracking.enabled=false",
     "figures.enabled=false",
 ]

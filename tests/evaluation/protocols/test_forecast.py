@@ -141,6 +141,7 @@ def test_sampled_paths_are_scored_as_distributions(
     """Of a stochastic policy and of constants with noise; single paths by their absolute error."""
     learner = ["learner=rollout", "learner.head=stochastic", "learner.epochs=1", "learner.steps=2"]
     small = ["learner.ensemble_size=1", "learner.horizon=4", "learner.compile=never"]
+    small.append("protocol.stride=3")
     monkeypatch.chdir(tmp_path)
     result = cfx.run([*FORECAST, "policy=gru", "protocol.samples=6", *learner, *small])
     table = pd.read_parquet(result.folder / "distributions.parquet")
