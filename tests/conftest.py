@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import gc
 import importlib
 import os
@@ -10,7 +11,6 @@ import shutil
 import sys
 import textwrap
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 import pytest
 from hydra._internal import defaults_list
 from hypothesis import settings
-from omegaconf import OmegaConf
+from omegaconf import OmegaConf, grammar_parser
 
 from cfx.data.base import DatasetSettings
 from cfx.data.pairs import PairSet
@@ -90,7 +90,9 @@ def _short_platoons(request: pytest.FixtureRequest) -> Iterator[None]:
     if request.config.getoption("markexpr") != "not slow":
         yield
         return
-    short = partial(measure_platoons, manoeuvre=Manoeuvre(settle=6.0, hold=2.0, after=4.0))
+    short = functools.partial(
+        measure_platoons, manoeuvre=Manoeuvre(settle=6.0, hold=2.0, after=4.0)
+    )
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(held_out, "measure_platoons", short)
         patch.setattr(within_driver, "measure_platoons", short)
@@ -99,7 +101,10 @@ def _short_platoons(request: pytest.FixtureRequest) -> Iterator[None]:
 
 @pytest.fixture(scope="session", autouse=True)
 def _parsed_once() -> Iterator[None]:
-    """Parses each text of YAML once a session: a quarter of the time in which Hydra composes."""
+    """Parses each text of YAML, and each interpolation, once a session.
+
+    That is a third of the time in which Hydra composes.
+    """
     known: dict[str, bytes] = {}
     load = OmegaConf.load
 
@@ -114,6 +119,9 @@ def _parsed_once() -> Iterator[None]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OmegaConf, "load", staticmethod(load_once))
+        parse_once = functools.lru_cache(maxsize=None)(grammar_parser.parse)
+        for module in ("base", "_utils"):
+            patch.setattr(f"omegaconf.{module}.parse", parse_once)
         yield
 
 

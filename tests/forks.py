@@ -20,6 +20,8 @@ from tests.conftest import ROOT
 _SERVER = """
 import gc, json, os, runpy, sys
 
+answers = os.fdopen(os.dup(1), "w")
+os.dup2(2, 1)  # what is imported may print
 exec(sys.argv[1], {"__name__": "imports"})
 gc.freeze()
 for line in iter(sys.stdin.readline, ""):
@@ -30,14 +32,14 @@ for line in iter(sys.stdin.readline, ""):
         answer = os.fork()
         if not answer:
             break
-    print(json.dumps(answer), flush=True)
+    print(json.dumps(answer), file=answers, flush=True)
 else:
     sys.exit()
 
 os.chdir(asked["folder"])
 os.environ.clear()
 os.environ.update(asked["environment"])
-for number, name in enumerate((os.devnull, asked["out"], asked["error"])):
+for number, name in enumerate((asked["given"], asked["out"], asked["error"])):
     os.dup2(os.open(name, os.O_RDWR | os.O_CREAT | os.O_APPEND), number)
 kind, *sys.argv = asked["command"]
 if kind == "-m":
@@ -109,30 +111,33 @@ class Forks:
     def __exit__(self, *_: object) -> None:
         self._server.communicate()
 
-    def start(
-        self, command: Sequence[str], folder: Path, changes: Mapping[str, str] | None = None
-    ) -> Fork:
+    def start(self, command: Sequence[str], folder: Path, *, given: str = "") -> Fork:
         """Starts a process.
 
         Args:
             command: what would follow `python`: `-m` and a module, `-c` and a text, or a script.
             folder: to start in.
-            changes: of the environment.
+            given: what it reads from its standard input.
         """
         self._count += 1
-        out, error = (self._folder / f"{self._count}.{name}" for name in ("out", "error"))
+        names = [f"{self._count}.{name}" for name in ("given", "out", "error")]
+        read, out, error = (self._folder / name for name in names)
+        read.write_text(given)
         asked = {
             "command": list(command),
             "folder": str(folder),
-            "environment": {**self._environment, **(changes or {})},
+            "environment": self._environment,
+            "given": str(read),
             "out": str(out),
             "error": str(error),
         }
         return Fork(self, self.ask(asked), out, error)
 
-    def run(self, command: Sequence[str], folder: Path) -> subprocess.CompletedProcess[str]:
-        """Runs a process to its end."""
-        fork = self.start(command, folder)
+    def run(
+        self, command: Sequence[str], folder: Path, given: str = ""
+    ) -> subprocess.CompletedProcess[str]:
+        """Runs a process to its end; `given` is what it reads from its standard input."""
+        fork = self.start(command, folder, given=given)
         code = fork.wait()
         return subprocess.CompletedProcess(
             command, code, fork.out.read_text(), fork.error.read_text()

@@ -264,7 +264,7 @@ def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(
         "-m",
         "hydra/launcher=joblib",
         "hydra.launcher.n_jobs=2",
-        "data=mine,synthetic",
+        "data=mine",
         "seed=0,1",
     ]
     environment = {
@@ -274,17 +274,19 @@ def test_a_multirun_in_worker_processes_composes_a_plugin_and_reports_failures(
     command = [sys.executable, "-c", script, *arguments]
     done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
     assert done.returncode == 2, done.stderr
-    assert "2 of 4 jobs done" in done.stdout
-    assert sum(line.startswith("failed: data=") for line in done.stderr.splitlines()) == 2
-    assert len(outputs(tmp_path)) == 2
+    assert "1 of 2 jobs done" in done.stdout
+    assert sum(line.startswith("failed: data=") for line in done.stderr.splitlines()) == 1
+    assert len(outputs(tmp_path)) == 1
     assert all(
         int((folder / "metrics.json").read_text()) != os.getpid() for folder in outputs(tmp_path)
     )
 
 
-def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) -> None:
+def test_help_lists_groups_sub_commands_and_only_keys_that_exist(run: Run, capsys) -> None:
     assert run("--help") == 0
     printed = capsys.readouterr().out
+    for command in registry.names("command"):
+        assert f"cfx {command.replace('.', ' ')} " in printed
     lines = (line.partition(": ") for line in printed.splitlines())
     listed = {group: set(names.split(", ")) for group, _, names in lines}
     assert listed["model"] >= {"krauss", "w74", "w99"}  # and those of plugins
@@ -298,17 +300,6 @@ def test_help_lists_the_groups_and_names_only_keys_that_exist(run: Run, capsys) 
     )
     assert [one for one in overrides if one not in printed] == []
     assert run("--cfg", "job", *overrides) == 0
-
-
-def test_every_sub_command_is_in_the_help(run: Run, capsys) -> None:
-    assert run("--help") == 0
-    said = capsys.readouterr().out
-    missing = [
-        command
-        for command in registry.names("command")
-        if f"cfx {command.replace('.', ' ')} " not in said
-    ]
-    assert not missing
 
 
 @pytest.mark.parametrize("command", registry.names("command"))

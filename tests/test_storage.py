@@ -23,6 +23,7 @@ from cfx.results.config import JobConfig
 from cfx_report.runs import read_runs
 from tests.broken_plugins import QUICK
 from tests.drives import straight_pairs
+from tests.report.conftest import blank_drawings
 
 pytest.importorskip("moto", reason="moto stands in for S3")
 
@@ -195,7 +196,8 @@ def test_a_job_whose_folder_was_copied_is_read_from_its_url(
     assert cfx.load(f"{url}/").folder == found.folder, "nothing is copied twice"
 
     monkeypatch.chdir(tmp_path)
-    assert cli.main(["report", url]) == 0
+    with blank_drawings():
+        assert cli.main(["report", url]) == 0
     assert cli.main(["report", url, "--tables", "csv"]) == 0
     assert cli.main(["export", url, "--to", "sumo"]) == 0
     assert url in (tmp_path / "report.html").read_text(encoding="utf-8")

@@ -115,7 +115,8 @@ def nothing_happened(folder: Path) -> None:
 
 
 def test_an_honest_folder_is_read_in_every_way(folder: Path) -> None:
-    assert read_all(folder, (*READERS, report)) == []
+    readers = [report if read is report_without_drawings else read for read in READERS]
+    assert read_all(folder, readers) == []
     nothing_happened(folder)
 
 

@@ -9,8 +9,6 @@ from __future__ import annotations
 import importlib.util
 import json
 import math
-import subprocess
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +29,7 @@ from cfx.simulation.trajectory import Start, Trajectory
 from cfx_classics.w74 import W74
 from cfx_sumo.idm import IdmSumo
 from cfx_sumo.krauss import KraussSumo
+from tests.forks import Forks
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,
@@ -58,6 +57,18 @@ def table() -> Iterator[None]:
             f"{model:32}"
             + "".join(f"{row[case]:18.1e}" if case in row else f"{'':18}" for case in cases)
         )
+
+
+_processes: list[Forks] = []
+"""What starts processes with SUMO in them."""
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _with_sumo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    with Forks("import libsumo", tmp_path_factory.mktemp("sumo")) as forks:
+        _processes[:] = [forks]
+        yield
+        _processes.clear()
 
 
 @dataclass(frozen=True)
@@ -206,13 +217,7 @@ def sumo(twin: Twin, drives: list[Drive]) -> list[dict[str, list[float]]]:
             }
         )
     script = Path(__file__).with_name("sumo_reference.py")
-    done = subprocess.run(
-        [sys.executable, str(script)],
-        input=json.dumps({"dt": DT, "runs": runs}),
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = _processes[0].run([str(script)], Path.cwd(), json.dumps({"dt": DT, "runs": runs}))
     assert done.returncode == 0, done.stderr
     return json.loads(done.stdout)["runs"]  # type: ignore[no-any-return]  # our own script's answer
 

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import matplotlib as mpl
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 from cfx.app import cli
@@ -78,7 +79,9 @@ def test_the_command_writes_a_jobs_figures_and_compares_several(
     assert float(width) == pytest.approx(72 * 88 / 25.4, abs=0.5)
     folder = tmp_path / "both"
     words = ["figures", str(first), str(second), "--format", "svg", "--folder", str(folder)]
-    assert cli.main(words) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Figure, "savefig", lambda figure, file, **options: file.touch())
+        assert cli.main(words) == 0
     assert (folder / "models.svg").is_file()
     assert len(list(folder.glob("*/error_distribution.svg"))) == 2
     assert "Closest to the drivers" in capsys.readouterr().out
