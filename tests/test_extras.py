@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 from hydra.errors import MissingConfigException
 
-from cfx.app.user_errors import explain
+from cfx.app.user_errors import explain, no_command
 from cfx.core import errors, registry
 from cfx.core.errors import PluginError
 from tests.conftest import ROOT
@@ -66,6 +66,12 @@ def test_an_option_that_is_not_installed_says_what_installs_it(
     assert "--editable '.[joblib]'" in explain(error, [])
     error = MissingConfigException("", missing_cfg_file="model/gips", options=["idm"])
     assert "Did you mean 'gipps'?" in explain(error, [])
+
+
+def test_a_sub_command_that_is_not_installed_says_what_installs_it() -> None:
+    said = no_command("plugins.new")
+    assert said.startswith("cfx plugins new is not installed. It comes with cfx-contracts: ")
+    assert "cfx --help" not in said
 
 
 def test_a_kind_that_only_plugins_bring_says_which(monkeypatch: pytest.MonkeyPatch) -> None:
