@@ -33,6 +33,7 @@ from cfx.core.threads import cores_limit, limit_cores
 from cfx.simulation.rollout import simulate
 
 QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures.enabled=false"]
+QUICK.append("calibration.prior=none")
 
 State = dict[str, Any]
 

@@ -32,6 +32,7 @@ QUICK = [
     "data.max_pairs=null",
     "figures.enabled=false",
     "tracking.enabled=false",
+    "calibration.prior=none",
 ]
 
 
@@ -149,7 +150,7 @@ def test_a_calibration_says_its_objective_and_reports_the_others(finished: cfx.J
 
 
 def test_another_objective_calibrates_other_parameters() -> None:
-    search = ["policy=fixed", "optimizer.samples=1024", "calibration.prior=none"]
+    search = ["policy=fixed", "optimizer.samples=1024"]
     speed = run(*search, "objective=speed_rmse")
     gap = run(*search, "objective=gap_rmse")
     for name, better, worse in (("speed_rmse", speed, gap), ("gap_rmse", gap, speed)):

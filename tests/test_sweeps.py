@@ -144,13 +144,13 @@ def test_after_failures_only_the_failed_jobs_run_again_also_with_another_launche
     run: Run, capsys
 ) -> None:
     Path("fail-1").touch()
-    assert run("-m", "seed=0,1,2") == 2
+    assert run("-m", "seed=1,2") == 2
     assert "failed: seed=1: drive 1 is broken" in capsys.readouterr().err
-    assert ran() == ["0", "1", "2"]
-    assert run("-m", "seed=0,1,2", "hydra.verbose=false") == 2
+    assert ran() == ["1", "2"]
+    assert run("-m", "seed=1,2", "hydra.verbose=false") == 2
     assert ran() == ["1"]
     Path("fail-1").unlink()
-    assert run("-m", "seed=0,1,2") == 0
+    assert run("-m", "seed=1,2") == 0
     assert ran() == ["1"]
     assert len(sweeps()) == 1
 
@@ -312,9 +312,9 @@ def test_a_sweep_keeps_no_configuration_of_its_jobs(
         kept.append(job_return)
 
     monkeypatch.setattr(SweepFolder, "on_job_end", noted)
-    assert run("-m", "seed=1,2,3") == 0
-    assert [one.hydra_cfg for one in kept] == [None, None, None]
-    assert [one.cfg for one in kept] == [None, None, None]
+    assert run("-m", "seed=1,2") == 0
+    assert [one.hydra_cfg for one in kept] == [None, None]
+    assert [one.cfg for one in kept] == [None, None]
     assert all(isinstance(one.return_value, float) for one in kept)
 
 

@@ -146,7 +146,8 @@ def test_folders_of_absolute_paths_are_left_out(text: str, kept: str) -> None:
 @pytest.mark.usefixtures("blank_figures")
 def test_the_page_names_no_folder_of_this_machine(sweep: Path) -> None:
     path = sweep.parent / "page.html"
-    assert main(["report", str(sweep), "--output", str(path)]) == 0
+    jobs = [str(sweep / f"{model}-0") for model in ("krauss", "w99")]
+    assert main(["report", *jobs, "--output", str(path)]) == 0
     text = path.read_text(encoding="utf-8")
     assert str(sweep.parent) not in text
     assert "/home/ann" not in text

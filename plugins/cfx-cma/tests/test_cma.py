@@ -91,6 +91,7 @@ def test_cfx_recovers_known_drivers_with_it(
             "protocol=within_driver",
             "data=synthetic",
             *options,
+            "calibration.prior=none",
             "tracking.enabled=false",
             "figures.enabled=false",
         ]

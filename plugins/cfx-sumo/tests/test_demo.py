@@ -28,6 +28,7 @@ SMALL = [
     "figures.enabled=false",
     "tracking.enabled=false",
     "learner.epochs=3",
+    "calibration.prior=none",
 ]
 OSM = SHIPPED.with_name("motorway.osm.xml")
 

@@ -45,6 +45,7 @@ QUICK = [
     "data.frames=200",
     "figures.enabled=false",
     "tracking.enabled=false",
+    "calibration.prior=none",
 ]
 
 

@@ -30,6 +30,7 @@ QUICK = [
     "data.frames=200",
     "figures.enabled=false",
     "tracking.enabled=false",
+    "calibration.prior=none",
 ]
 TRAINED = [*QUICK, "data.pairs=6", "data.seed=5"]
 HERE = [*QUICK, "data.pairs=3", "data.seed=9", "protocol=transfer"]
