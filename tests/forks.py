@@ -36,6 +36,7 @@ for line in iter(sys.stdin.readline, ""):
 else:
     sys.exit()
 
+answers.close()
 os.chdir(asked["folder"])
 os.environ.clear()
 os.environ.update(asked["environment"])
@@ -88,11 +89,11 @@ class Fork:
 
 
 class Forks:
-    """Starts processes that have done `imports` already; `with` ends the one they come from."""
+    """Starts processes that have done `imports` already; `with` ends them and whom they come from."""
 
     def __init__(self, imports: str, folder: Path) -> None:
         self._folder = folder
-        self._count = 0
+        self._started: list[Fork] = []
         environment = {**os.environ, "OMP_NUM_THREADS": "1"}
         environment["PYTHONPATH"] = os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])
         environment.pop("MLFLOW_TRACKING_URI", None)
@@ -109,6 +110,9 @@ class Forks:
         return self
 
     def __exit__(self, *_: object) -> None:
+        for fork in self._started:
+            if fork.poll() is None:
+                fork.kill()
         self._server.communicate()
 
     def start(self, command: Sequence[str], folder: Path, *, given: str = "") -> Fork:
@@ -119,8 +123,8 @@ class Forks:
             folder: to start in.
             given: what it reads from its standard input.
         """
-        self._count += 1
-        names = [f"{self._count}.{name}" for name in ("given", "out", "error")]
+        number = len(self._started)
+        names = [f"{number}.{name}" for name in ("given", "out", "error")]
         read, out, error = (self._folder / name for name in names)
         read.write_text(given)
         asked = {
@@ -131,7 +135,8 @@ class Forks:
             "out": str(out),
             "error": str(error),
         }
-        return Fork(self, self.ask(asked), out, error)
+        self._started.append(Fork(self, self.ask(asked), out, error))
+        return self._started[-1]
 
     def run(
         self, command: Sequence[str], folder: Path, given: str = ""

@@ -15,7 +15,6 @@ import cfx
 from cfx.core.errors import ConfigError, DataError
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 64}
-"""How to calibrate for a test; policies that were saved say themselves how drivers are calibrated."""
 SMALL = {
     **RANDOM,
     "calibration.prior": "none",
