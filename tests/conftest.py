@@ -12,7 +12,7 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 # PyTorch's threads spin while they wait, and take the cores that other test processes want: small
 # tests cost ten times as much CPU time. PyTorch reads this when it is imported.
@@ -23,13 +23,10 @@ from hydra._internal import defaults_list
 from hypothesis import settings
 from omegaconf import OmegaConf, grammar_parser
 
-from cfx.data.base import DatasetSettings
-from cfx.data.pairs import PairSet
-from cfx.data.tidy import TidyDataset
-from cfx.evaluation.platoon import Manoeuvre, measure_platoons
-from cfx.evaluation.protocols import held_out, within_driver
-from cfx.simulation.synthetic import SyntheticDataset
-from cfx_mlflow import store
+# xdist's own process reads this file too, and runs no test: fixtures import what takes seconds.
+if TYPE_CHECKING:
+    from cfx.data.pairs import PairSet
+    from cfx.simulation.synthetic import SyntheticDataset
 
 pytest_plugins = ["tests.browser"]
 
@@ -56,6 +53,9 @@ def simulated_anew() -> Iterator[list[bool]]:
 
     What a job selects from a recording is no part of it.
     """
+    from cfx.data.base import DatasetSettings
+    from cfx.simulation.synthetic import SyntheticDataset
+
     anew = [False]
     selection = set(DatasetSettings.model_fields)
     known: dict[str, PairSet] = {}
@@ -90,6 +90,9 @@ def _short_platoons(request: pytest.FixtureRequest) -> Iterator[None]:
     if request.config.getoption("markexpr") != "not slow":
         yield
         return
+    from cfx.evaluation.platoon import Manoeuvre, measure_platoons
+    from cfx.evaluation.protocols import held_out, within_driver
+
     short = functools.partial(
         measure_platoons, manoeuvre=Manoeuvre(settle=6.0, hold=2.0, after=4.0)
     )
@@ -154,6 +157,8 @@ def _scores_without_compiling() -> None:
 @pytest.fixture(scope="session", autouse=True)
 def _migrated_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Lets MLflow run its migrations once a session, and not for 1 s of each new database."""
+    from cfx_mlflow import store
+
     migrated = tmp_path_factory.mktemp("store") / "migrated.db"
     create = store._create
 
@@ -191,6 +196,8 @@ def shared_data() -> Path:
 @pytest.fixture(scope="session")
 def i80_pairs(shared_data: Path) -> PairSet:
     """All pairs of the reconstructed recordings of I-80."""
+    from cfx.data.tidy import TidyDataset
+
     path = shared_data / "i80_reconstructed_pairs.parquet"
     return TidyDataset(path=path, min_frames=2, accelerations="recorded").load()
 
