@@ -53,7 +53,7 @@ print(f"improvement {metrics[f'{key}/mean']:+.1%} (95 % interval {low:+.1%} to {
 # %% [markdown]
 # Does the interval exclude zero? Run it again with `seed=1`: other folds, other networks. With
 # real drivers expect less than with these: [on I-80](../results.md#unseen-drivers) the policy for
-# IDM improves by 5.6 % over pooled parameters, that for Krauss by 14.7 %.
+# IDM improves by 5.6 % over pooled parameters, that for Krauss by 14.6 %.
 #
 # ## For whom?
 #
