@@ -51,7 +51,7 @@ from cfx.core.errors import (
 )
 from cfx.core.guest import guest, visit
 from cfx.core.memory import is_out_of_memory
-from cfx.core.processes import raise_if_terminated, signal_behind, terminable
+from cfx.core.processes import raise_if_signalled, signal_behind, terminable
 from cfx.core.registry import blame
 from cfx.core.storage import is_url
 
@@ -95,7 +95,7 @@ class JobFunction:
         Raises:
             JobFailedError: it failed, and the sweeper optimises: it counts failures.
         """
-        raise_if_terminated()
+        raise_if_signalled()
         hydra_config = HydraConfig.get()
         folder = Path(hydra_config.runtime.output_dir)
         # As typed, `${...}` included.

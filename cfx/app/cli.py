@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn, cast
 
 from cfx.core.errors import CfxError, ConfigError, Terminated
-from cfx.core.processes import ignore_signals, raise_if_terminated, signal_behind, terminable
+from cfx.core.processes import ignore_signals, raise_if_signalled, signal_behind, terminable
 
 if TYPE_CHECKING:
     from cfx.core.command import Command
@@ -42,13 +42,13 @@ def main(argv: Sequence[str] | None = None) -> int:
             try:
                 code = _run(arguments)
             except Exception as error:
-                raise_if_terminated()
+                raise_if_signalled()
                 signalled = signal_behind(error)
                 if signalled is not None:
                     raise signalled from error
                 raise
             if code == 1:
-                raise_if_terminated()
+                raise_if_signalled()
             return code
     except CfxError as error:
         print(error, file=sys.stderr)

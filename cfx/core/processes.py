@@ -25,45 +25,59 @@ if TYPE_CHECKING:
     import loky
 
 
-class _Terminate:
-    """A handler of SIGTERM that remembers what it raised."""
+class _Handler:
+    """Raises at a signal, and remembers that it did.
 
-    def __init__(self) -> None:
-        self.raised: Terminated | None = None
+    Args:
+        kind: what is raised.
+    """
+
+    def __init__(self, kind: type[BaseException]) -> None:
+        self.kind = kind
+        self.raised: BaseException | None = None
 
     def __call__(self, _number: int, _frame: FrameType | None) -> None:
-        self.raised = Terminated()
+        self.raised = self.kind()
         raise self.raised
 
 
 @contextlib.contextmanager
 def terminable() -> Iterator[None]:
-    """Turns SIGTERM into `Terminated`."""
-    if isinstance(signal.getsignal(signal.SIGTERM), _Terminate):
-        yield
-        return
+    """Turns SIGTERM into `Terminated`, and Ctrl-C into a KeyboardInterrupt that is remembered.
+
+    Whoever ignores Ctrl-C, or handles it by themselves, goes on to do so.
+    """
+    kinds: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated}
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        kinds[signal.SIGINT] = KeyboardInterrupt
+    if isinstance(signal.getsignal(signal.SIGTERM), _Handler):
+        kinds = {}
+    before = {}
     try:
-        before = signal.signal(signal.SIGTERM, _Terminate())
+        for number, kind in kinds.items():
+            before[number] = signal.signal(number, _Handler(kind))
     except ValueError:  # not in the main thread, where signals do not arrive either
         yield
         return
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
-def raise_if_terminated() -> None:
-    """Raises again what SIGTERM raised in code that went on or failed otherwise.
+def raise_if_signalled() -> None:
+    """Raises again what a signal raised in code that went on or failed otherwise.
 
-    OmegaConf and C code that imports a module do so.
+    OmegaConf and C code, such as pydantic's and that which imports a module, do so.
 
     Raises:
-        Terminated: SIGTERM arrived in a block of `terminable`.
+        Terminated, KeyboardInterrupt: SIGTERM or Ctrl-C arrived in a block of `terminable`.
     """
-    handler = signal.getsignal(signal.SIGTERM)
-    if isinstance(handler, _Terminate) and handler.raised is not None:
-        raise handler.raised
+    for number in (signal.SIGTERM, signal.SIGINT):
+        handler = signal.getsignal(number)
+        if isinstance(handler, _Handler) and handler.raised is not None:
+            raise handler.raised
 
 
 def signal_behind(error: BaseException) -> BaseException | None:

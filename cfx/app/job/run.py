@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from cfx.core import registry
+from cfx.core.processes import raise_if_signalled
 from cfx.data.base import load_pairs
 from cfx.results.config import JobConfig
 
@@ -38,6 +39,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     from cfx.app.job.console import described, report, report_places
     from cfx.results.tracker import tracked
 
+    raise_if_signalled()  # imports swallow Ctrl-C
     data = config.data
     console = console or Console()
     config, parts = steps.prepare(config)
