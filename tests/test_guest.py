@@ -301,6 +301,7 @@ def _program(arguments: list[str], folder: Path) -> str:
 
 APPLICATION = """
 import hydra
+import lightning.pytorch as pl
 import mlflow
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
@@ -308,11 +309,13 @@ from mlflow.utils import autologging_utils
 
 mlflow.set_tracking_uri("sqlite:///callers.db")
 mlflow.set_experiment("callers")
+fit = pl.Trainer.fit
 mlflow.autolog()
-import lightning.pytorch as pl
+assert pl.Trainer.fit is not fit, "Lightning logs by itself"
 import cfx
 
 QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures.enabled=false"]
+QUICK += ["calibration.prior=none", "cores=1"]
 
 def fails(*_):
     raise SystemError
@@ -332,7 +335,8 @@ def main(config):
         assert mlflow.active_run().info.run_id == mine.info.run_id
     assert HydraConfig.get() is hydras[0]
     assert GlobalHydra.instance().hydra is hydras[1]
-    assert mlflow.get_run(mine.info.run_id).data.metrics == {}
+    data = mlflow.get_run(mine.info.run_id).data
+    assert not data.metrics and not data.params, (data.metrics, data.params)
     runs = mlflow.search_runs(experiment_names=["callers"])
     assert len(runs) == 1, runs.to_string()
     print("went on")
