@@ -42,7 +42,6 @@ def main(argv: Sequence[str] | None = None) -> int:
             try:
                 code = _run(arguments)
             except Exception as error:
-                raise_if_signalled()
                 signalled = signal_behind(error)
                 if signalled is not None:
                     raise signalled from error

@@ -74,10 +74,18 @@ def raise_if_signalled() -> None:
     Raises:
         Terminated, KeyboardInterrupt: SIGTERM or Ctrl-C arrived in a block of `terminable`.
     """
+    arrived = _arrived()
+    if arrived is not None:
+        raise arrived
+
+
+def _arrived() -> BaseException | None:
+    """Returns what a signal raised in a block of `terminable`."""
     for number in (signal.SIGTERM, signal.SIGINT):
         handler = signal.getsignal(number)
         if isinstance(handler, _Handler) and handler.raised is not None:
-            raise handler.raised
+            return handler.raised
+    return None
 
 
 def signal_behind(error: BaseException) -> BaseException | None:
@@ -91,7 +99,7 @@ def signal_behind(error: BaseException) -> BaseException | None:
         if isinstance(current, KeyboardInterrupt | Terminated):
             return current
         current = current.__context__
-    return None
+    return _arrived()
 
 
 def ignore_signals() -> None:
