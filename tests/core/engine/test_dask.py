@@ -62,7 +62,7 @@ def test_what_is_not_installed_is_said_with_the_line_that_installs_it(
 @pytest.mark.slow
 def test_making_it_imports_nothing_of_dask() -> None:
     script = (
-        "import sys; from cfx import registry;"
+        "import sys; from cfx.core import registry;"
         " registry.create('engine', {'name': 'dask'});"
         " sys.exit(str({'dask', 'distributed'} & set(sys.modules) or '') or 0)"
     )
