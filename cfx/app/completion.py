@@ -87,3 +87,14 @@ def complete_with(
         return list(answers(parsed_args))
 
     action.completer = completer  # type: ignore[attr-defined] # where argcomplete looks for it
+
+
+def add_kind(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
+    """Adds the argument `kind`: of components, all kinds if it may be left out."""
+    from cfx.core import registry
+
+    about = f"{', '.join(registry.KINDS)} (data is a dataset too)"
+    if optional:
+        about += "; all kinds if left out"
+    action = parser.add_argument("kind", nargs="?" if optional else None, help=about)
+    complete_with(action, lambda _: registry.KINDS)

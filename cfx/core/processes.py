@@ -47,11 +47,12 @@ def terminable() -> Iterator[None]:
 
     Whoever ignores Ctrl-C, or handles it by themselves, goes on to do so.
     """
+    if isinstance(signal.getsignal(signal.SIGTERM), _Handler):
+        yield
+        return
     kinds: dict[int, type[BaseException]] = {signal.SIGTERM: Terminated}
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         kinds[signal.SIGINT] = KeyboardInterrupt
-    if isinstance(signal.getsignal(signal.SIGTERM), _Handler):
-        kinds = {}
     before = {}
     try:
         for number, kind in kinds.items():

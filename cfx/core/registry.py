@@ -503,9 +503,11 @@ def _try(found: Entry, component: Component, settings: BaseModel) -> None:
     Raises:
         PluginError: it breaks its contract; names the distribution.
     """
-    key = (found, settings.model_dump_json())
     first = kind_of(found.kind).first
-    if not first or key in _tried or not __debug__:
+    if not first or not __debug__:
+        return
+    key = (found, settings.model_dump_json())
+    if key in _tried:
         return
     for _, sentence in violations(component, _resolve(first)):
         raise PluginError(f"{found} breaks its contract: {sentence}{_remedy(found)}")

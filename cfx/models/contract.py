@@ -11,18 +11,14 @@ from cfx.core.contract import NotApplicable, expect_tensor
 from cfx.models.base import DrivingModel, Follower, Leader
 
 DT = 0.1
-
-
 LENGTH = 5.0
-
-
 DRIVES = 64  # random states and parameter sets of the ordinary kind
-
 
 Step = tuple[Follower, Leader, dict[str, Tensor]]
 
 
 def require_equations(model: DrivingModel) -> None:
+    """Leaves out a model without equations in Python."""
     if model.needs_simulator:
         raise NotApplicable(f"the model has equations in {model.needs_simulator} only")
 
@@ -143,6 +139,7 @@ def _states(model: DrivingModel, draw: torch.Generator) -> tuple[Follower, Leade
 
 
 def on_all(step: Step, change: Callable[[Tensor], Tensor]) -> Step:
+    """Returns a step of which every tensor was changed in the same way."""
     follower, leader, p = step
     return (
         Follower(*(change(x) for x in follower)),
@@ -152,6 +149,7 @@ def on_all(step: Step, change: Callable[[Tensor], Tensor]) -> Step:
 
 
 def in_dtype(step: Step, dtype: torch.dtype) -> Step:
+    """Returns a step in another dtype."""
     return on_all(step, lambda x: x.to(dtype))
 
 

@@ -14,7 +14,6 @@ from cfx.simulation.settings import WindowSettings
 NETWORKS, DRIVERS, WINDOWS, PARAMETERS, LENGTH = 3, 2, 7, 5, 5
 """As many parameters as IDM has, for which a policy is built."""
 
-
 DT = 0.1
 """Time step, s."""
 
@@ -59,6 +58,7 @@ def answers_in_the_precision_of_a_job(policy: Policy) -> None:
 def build(
     policy: Policy, features: int, *, seed: int, dtype: torch.dtype = torch.float32
 ) -> PolicyNetwork:
+    """Returns networks for IDM, with weights of a seed."""
     policy = policy.for_model(IDM(), DT, WindowSettings(length=LENGTH, stride=LENGTH))
     generator = torch.Generator().manual_seed(seed)
     fixed = torch.rand((NETWORKS, PARAMETERS), generator=torch.Generator().manual_seed(0)).to(dtype)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import cast
 
 import torch
+from torch import Tensor
 
 from cfx.core import registry
 from cfx.core.contract import NotApplicable, expect_tensor, once
@@ -34,7 +36,7 @@ def _first_drivable(simulator: Simulator) -> DrivingModel | None:
     for name in _MODELS:
         if name not in registry.names("model"):
             continue
-        candidate = cast(DrivingModel, registry.create("model", {"name": name}))
+        candidate = cast(DrivingModel, registry.get("model", name)())
         try:
             simulator.require(candidate)
         except ConfigError:
@@ -88,15 +90,21 @@ def steps_in_this_process_keep_shape_and_dtype(
         follower, ahead, p = in_dtype(states, dtype)
         start = Start(follower.position, follower.speed, follower.acceleration)
         position, speed, acceleration = (signal.expand(STEPS, DRIVES) for signal in ahead[:3])
-        leader = Leader(position, speed, acceleration, ahead.length)
-        end, position, speed = stepper.advance(stepper.begin(start), leader, p)
-        expect_tensor(end.speed, "advance's follower", (DRIVES,), dtype, "(*batch,)")
-        for name, value in (("positions", position), ("speeds", speed)):
-            expect_tensor(value, f"advance's {name}", (STEPS, DRIVES), dtype, "(K, *batch)")
-            assert value.device == start.speed.device, f"{name} must stay on their device"
-            assert bool(value.isfinite().all()), (
-                f"advance gives {name} that are not finite in ordinary states"
-            )
+        expect_steps(stepper, start, Leader(position, speed, acceleration, ahead.length), p)
+
+
+def expect_steps(stepper: Stepper, start: Start, leader: Leader, p: Mapping[str, Tensor]) -> None:
+    """Asserts that steps are finite, and keep shape, dtype and device of what is given."""
+    batch, dtype = start.speed.shape, start.speed.dtype
+    end, position, speed = stepper.advance(stepper.begin(start), leader, p)
+    expect_tensor(end.speed, "advance's follower", batch, dtype, "(*batch,)")
+    steps = (len(leader.position), *batch)
+    for name, value in (("positions", position), ("speeds", speed)):
+        expect_tensor(value, f"advance's {name}", steps, dtype, "(K, *batch)")
+        assert value.device == start.speed.device, f"{name} must stay on their device"
+        assert bool(value.isfinite().all()), (
+            f"advance gives {name} that are not finite in ordinary states"
+        )
 
 
 FIRST = (

@@ -12,7 +12,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from pydantic_core import to_jsonable_python
 
-from cfx.app.completion import complete_with
+from cfx.app.completion import add_kind, complete_with
 from cfx.core import registry
 from cfx.core.command import Command
 from cfx.core.console import blank_table, put
@@ -34,8 +34,7 @@ class PluginsCommand(Command):
         )
         actions = made.add_subparsers(dest="action")
         show = actions.add_parser("show", help="a component's parameters, settings and reference")
-        about = f"{', '.join(registry.KINDS)} (data is a dataset too)"
-        complete_with(show.add_argument("kind", help=about), lambda _: registry.KINDS)
+        add_kind(show)
         complete_with(
             show.add_argument("name", help="one component"),
             lambda options: registry.names(options.kind),

@@ -10,13 +10,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from cfx.app import nodes
-from cfx.app.completion import complete_with
+from cfx.app.completion import add_kind, complete_with
 from cfx.core import registry
 from cfx.core.command import Command
 from cfx.core.component import API_VERSION
 from cfx.core.console import blank_table, console_logging, put
+from cfx.core.contract import violations
 from cfx.core.errors import OWN, CfxError, ConfigError, NotInstalledError, in_words
 from cfx.core.progress import Task
+from cfx_contracts import contract_for
 
 
 class CheckCommand(Command):
@@ -26,8 +28,7 @@ class CheckCommand(Command):
 
     def parser(self) -> argparse.ArgumentParser:
         made = argparse.ArgumentParser("cfx plugins check", description=self.summary)
-        about = f"{', '.join(registry.KINDS)} (data is a dataset too); all kinds if left out"
-        complete_with(made.add_argument("kind", nargs="?", help=about), lambda _: registry.KINDS)
+        add_kind(made, optional=True)
         name = made.add_argument(
             "name", nargs="?", help="one component; all of the kind if left out"
         )
@@ -174,9 +175,6 @@ def _shadow(entry: registry.Entry) -> str:
 
 def _broken_contract(entry: registry.Entry, component: object) -> str:
     """Returns the first statement of the contract that does not hold; "" if all hold."""
-    from cfx.core.contract import violations
-    from cfx_contracts import contract_for
-
     found = list(violations(component, contract_for(entry.kind).quick))
     if not found:
         return ""

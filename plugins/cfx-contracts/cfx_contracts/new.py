@@ -15,7 +15,7 @@ import tempfile
 from pathlib import Path
 from typing import Any
 
-from cfx.app.completion import complete_with
+from cfx.app.completion import add_kind
 from cfx.core import registry
 from cfx.core.command import Command
 from cfx.core.component import API_VERSION
@@ -31,8 +31,7 @@ class NewCommand(Command):
 
     def parser(self) -> argparse.ArgumentParser:
         made = argparse.ArgumentParser("cfx plugins new", description=self.summary)
-        about = f"{', '.join(registry.KINDS)} (data is a dataset too)"
-        complete_with(made.add_argument("kind", help=about), lambda _: registry.KINDS)
+        add_kind(made)
         made.add_argument("name", help="as in model=NAME: lower-case letters, digits and _")
         made.add_argument("--folder", type=Path, help="where to write it; default: cfx-NAME, here")
         return made
