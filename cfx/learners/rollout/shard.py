@@ -12,7 +12,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,22 +47,9 @@ def checkpoint_path(
     """
     if training_data.workspace is None:
         return None
-    recorded, pairs = training_data.recorded, training_data.pairs
-    tensors = [
-        recorded.leader_position,
-        recorded.leader_speed,
-        recorded.follower_position,
-        recorded.follower_speed,
-        pairs.index,
-        pairs.split.frame,
-        pairs.fixed,
-        pairs.network,
-    ]
-    if pairs.base is not None:
-        tensors.append(pairs.base)
     digest = hashlib.sha256()
-    for tensor in tensors:
-        digest.update(tensor.detach().cpu().contiguous().numpy().tobytes())
+    _add_content(digest, training_data.recorded)
+    _add_content(digest, training_data.pairs)
     description = {
         "learner": learner,
         "policy": policy.identity(),
@@ -70,12 +57,30 @@ def checkpoint_path(
         "objective": training_data.objective.identity(),
         "windows": training_data.windows.model_dump(),
         "code": folder_hash(base.__file__),
-        "trajectories": digest.hexdigest(),
+        "data": digest.hexdigest(),
+        "dt": training_data.simulator.dt,
         "names": training_data.names,
-        "drivers": pairs.drivers,
         "seed": training_data.seed,
     }
     return training_data.workspace / f"{content_key(description)}.ckpt"
+
+
+def _add_content(digest: hashlib._Hash, record: Any) -> None:
+    """Adds all that a dataclass holds to a digest.
+
+    Every field counts, so that a field which is added later changes the key too. The type and shape
+    of a tensor count beside its numbers: `(2, 3)` and `(3, 2)` zeros have the same bytes.
+    """
+    for field in fields(record):
+        value = getattr(record, field.name)
+        digest.update(f"\n{field.name}=".encode())
+        if is_dataclass(value):
+            _add_content(digest, value)
+        elif isinstance(value, Tensor):
+            digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
+            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+        else:
+            digest.update(repr(value).encode())
 
 
 _TRAJECTORIES = 3_000

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,8 @@ from cfx.calibration.objectives import Objective
 from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.calibration.theil_u import TheilU
 from cfx.core.errors import ConfigError
-from cfx.learners.base import TrainingResult
+from cfx.data.pairs import PairBatch
+from cfx.learners.base import TrainingPairs, TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.learners.rollout.module import RolloutModule
 from cfx.learners.rollout.shard import checkpoint_path
@@ -26,6 +27,7 @@ from cfx.policies.core import Ensemble
 from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.windows import Split
 from tests.learners.made import (
     COMPILED,
     INPUTS,
@@ -182,6 +184,32 @@ def test_a_checkpoint_of_another_training_is_not_taken_up(tmp_path: Path) -> Non
     assert found != checkpoint_path(
         RolloutLearner(**(QUICK | {"steps": 16})).identity(), policy, data
     )
+
+
+def test_a_checkpoint_of_other_data_is_not_taken_up(tmp_path: Path) -> None:
+    """Whatever is changed of the recordings or of what is learned from them gives another file."""
+    policy, identity = gru(), RolloutLearner(**QUICK).identity()
+    data = training_data(workspace=tmp_path, base=TRUE * 1.3)
+    others = []
+    for name in ("recorded", "pairs"):
+        record = getattr(data, name)
+        for field in fields(record):
+            value = getattr(record, field.name)
+            if isinstance(value, torch.Tensor):
+                value = ~value if value.dtype == torch.bool else value + 1
+            elif isinstance(value, Split):
+                value = replace(value, frame=value.frame - 1)
+            elif field.name in {"drivers", "sites"}:
+                value = ("other",) * len(data.pairs)
+            elif field.name == "dt":
+                value = 0.2
+            else:
+                assert (field.name, value) == ("labels", None)
+                continue
+            others.append(replace(data, **{name: replace(record, **{field.name: value})}))
+    files = {checkpoint_path(identity, policy, one) for one in (data, *others)}
+    assert len(others) == len(fields(PairBatch)) + len(fields(TrainingPairs)) - 1
+    assert len(files) == 1 + len(others)
 
 
 def test_nothing_is_learned_from_validation_drivers() -> None:
