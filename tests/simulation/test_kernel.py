@@ -274,6 +274,31 @@ def test_a_model_that_is_not_elementwise_is_left_to_pytorch(model: DrivingModel)
     assert accumulate(model, DT, made_up_segments(), p, Terms(squares, "squares")) is None
 
 
+def hyperbolic(
+    speed: Tensor, gap: Tensor, measured_speed: Tensor, measured_gap: Tensor
+) -> tuple[Tensor]:
+    return (torch.cosh(speed - measured_speed),)
+
+
+class Hyperbolic(SpeedRmse):
+    """An objective with an operation that has no C++ counterpart."""
+
+
+@pytest.mark.parametrize(
+    ("model", "terms", "named"),
+    [
+        (Krauss(), Terms(hyperbolic, ComponentKey(Hyperbolic, "")), "Hyperbolic"),
+        (Branches(), Terms(squares, ComponentKey(SpeedRmse, "")), "Branches"),
+    ],
+)
+def test_what_has_no_kernel_is_named(
+    model: DrivingModel, terms: Terms, named: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level("INFO"):
+        assert accumulate(model, DT, made_up_segments(), candidates_of(model), terms) is None
+    assert f"{named} has no compiled kernel" in caplog.text
+
+
 class Remembers(Krauss):
     """Drives with the mean of its speeds: a memory that begins with the first one, and counts."""
 

@@ -131,6 +131,18 @@ def record(
     return StepProgram(statements, state, memory, tuple(term[0] for term in added))
 
 
+def record_terms(terms: Terms, dtype: torch.dtype) -> None:
+    """Records what a frame adds to an objective's sums alone, without a model.
+
+    Tells whether the objective or the model is why a step has no kernel.
+
+    Raises:
+        Unsupported: as `record`.
+    """
+    names = INPUTS[:4]
+    _Recording(names).function(_traced(terms.function, len(names), dtype))
+
+
 def _traced(
     function: Callable[..., Sequence[Tensor]], inputs: int, dtype: torch.dtype, simpler: Any = None
 ) -> fx.Graph:

@@ -22,7 +22,7 @@ from cfx.models.base import DrivingModel
 from cfx.simulation import step
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import Unsupported
-from cfx.simulation.kernel.graph import record
+from cfx.simulation.kernel.graph import record, record_terms
 from cfx.simulation.kernel.source import BLOCK, SIGNALS, write
 from cfx.simulation.trajectory import ComponentKey, Segments, Terms, common_shape
 
@@ -201,11 +201,21 @@ def _source(model: DrivingModel, terms: Terms, key: KernelKey) -> str:
     try:
         program = record(model, names, key.dt, terms, key.dtype)
     except Unsupported as reason:
-        name = type(model).__name__
+        name = _without_kernel(model, terms, key.dtype)
         log.info("%s has no compiled kernel (%s); PyTorch simulates it", name, reason)
         return ""
     varied = [varied for _, varied in key.parameters]
     return write(program, varied, key.dtype, summed=key.summed)
+
+
+def _without_kernel(model: DrivingModel, terms: Terms, dtype: torch.dtype) -> str:
+    """Returns the name of the objective if it alone cannot be recorded, else that of the model."""
+    try:
+        record_terms(terms, dtype)
+    except Unsupported:
+        if isinstance(terms.key, ComponentKey):
+            return terms.key.component.__name__
+    return type(model).__name__
 
 
 def _run(
