@@ -265,6 +265,10 @@ PROTOCOL = """
         ),
         (["show", "data", "tdy"], "data=tdy: there is no dataset 'tdy'. Did you mean 'tidy'?"),
         (["new", "modle", "mine"], "there is no kind of component 'modle'. Did you mean 'model'?"),
+        (
+            ["new", "tracker", "mine"],
+            "there is no template of the kind 'tracker'; there are templates of: command, ",
+        ),
         (["new", "model", "krauss"], "the name 'krauss' is taken by model 'krauss'"),
         (
             ["new", "model", "My-Model"],

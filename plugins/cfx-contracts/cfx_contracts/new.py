@@ -45,13 +45,14 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
     """Writes a package, whole or not at all, and says what to do with it; returns its folder.
 
     Raises:
-        PluginError: there is no such kind, or the name is taken.
+        PluginError: there is no such kind or no template of it, or the name is taken.
         ConfigError: the name cannot be one.
         OutputError: the folder exists or cannot be written.
     """
     from copier import run_copy
 
     found = registry.kind_of(kind)
+    _check_template(found)
     _check_name(found, name)
     words = _words(found, name)
     target = (folder or Path(words["distribution"])).expanduser()
@@ -74,6 +75,17 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
         ) from error
     print(_next_steps(found, name, target))
     return target
+
+
+def _check_template(kind: registry.Kind) -> None:
+    """Refuses a kind of which there is no template, such as one that another plugin adds."""
+    kinds = sorted(folder.name for folder in _TEMPLATE.iterdir() if folder.name != "common")
+    if kind.name not in kinds:
+        raise PluginError(
+            f"there is no template of the kind '{kind.name}'; there are templates of:"
+            f" {', '.join(kinds)}. Write a class that extends {kind.base.replace(':', '.')} and an"
+            f" entry point of the group {kind.entry_points}"
+        )
 
 
 def _check_name(kind: registry.Kind, name: str) -> None:
