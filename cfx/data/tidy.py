@@ -282,7 +282,7 @@ class TidyDataset(Dataset):
 
     Columns may have names and units of the file's own (`columns`, `units`).
 
-    A folder stands for the parquet files in it, one recording each (`cfx.data.partitions`).
+    A folder stands for the parquet files in it, one recording each (`cfx.data.files.partitions`).
     With `data.recording` the others are not read.
 
     Rows may be in any order. Several files are read as one: a recording may go on in another file,

@@ -1,5 +1,5 @@
-"""Figures: a file for each subject says what is shown, how it is drawn and what is said of it.
+"""Figures: what a figure of a finished job is, and how all figures look.
 
-`figure.py` says what a figure is and what it is drawn from, `canvas.py` how all look. A job writes
-them (`write.py`), a report shows the same as SVG. `jobs.py` has those of several jobs.
+`figure.py` says what a figure shows of the results and how it is written, `canvas.py` has fonts,
+paper and lines, `text.py` the names of methods and units, `job.py` reads a finished job's folder.
 """

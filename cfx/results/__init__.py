@@ -1,1 +1,1 @@
-"""Tracking: what MLflow keeps of a job."""
+"""Results: the configuration of a job, its tables, and where jobs are tracked."""
