@@ -88,7 +88,7 @@ conf: $(VENV)/.ready
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
 # What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark, SUMO, traffic.
-EVERYBODYS = plugins/cfx-botorch plugins/cfx-classics plugins/cfx-contracts plugins/cfx-estimators plugins/cfx-forecasts plugins/cfx-posteriors plugins/cfx-report plugins/cfx-recordings plugins/cfx-benchmark plugins/cfx-sumo plugins/cfx-traffic plugins/cfx-mlflow plugins/cfx-sklearn
+EVERYBODYS = plugins/cfx-community plugins/cfx-contracts plugins/cfx-forecasts plugins/cfx-posteriors plugins/cfx-recordings plugins/cfx-report plugins/cfx-sumo
 $(VENV)/.ready: pyproject.toml $(EVERYBODYS:%=%/pyproject.toml) constraints.txt $(VENV)/.torch
 	$(PIP) install --quiet --constraint constraints.txt $(addprefix --editable ,. $(EVERYBODYS))
 	touch $@

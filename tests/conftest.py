@@ -157,7 +157,7 @@ def _scores_without_compiling() -> None:
 @pytest.fixture(scope="session", autouse=True)
 def _migrated_once(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Lets MLflow run its migrations once a session, and not for 1 s of each new database."""
-    from cfx_mlflow import store
+    from cfx.results.mlflow import store
 
     migrated = tmp_path_factory.mktemp("store") / "migrated.db"
     create = store._create

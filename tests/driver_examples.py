@@ -1,6 +1,6 @@
-"""Drives as the examples of cfx-onnx, cfx-fmi and cfx-gym do, from whatever installation runs it.
+"""Drives as the examples of cfx-drivers, cfx-drivers and cfx-drivers do, from whatever installation runs it.
 
-`python driver_examples.py PLATOON`, PLATOON being cfx-onnx's example, in an empty folder.
+`python driver_examples.py PLATOON`, PLATOON being cfx-drivers's example, in an empty folder.
 """
 
 import runpy
@@ -18,16 +18,16 @@ from fmpy.validation import validate_fmu
 from gymnasium.utils.env_checker import check_env
 
 import cfx
-import cfx_fmi
-import cfx_gym
-import cfx_onnx
+import cfx_drivers.fmi
+import cfx_drivers.gym
+import cfx_drivers.onnx
 from cfx.app import cli
 
 DRIVER, LENGTH, DT = "cfx://i80-idm", 5.0, 0.1
 
 
 def platoon(example: str) -> pd.DataFrame:
-    """Returns the speeds of a platoon that cfx-onnx's example drives, without cfx."""
+    """Returns the speeds of a platoon that cfx-drivers's example drives, without cfx."""
     assert cli.main(["export", DRIVER, "--to", "onnx", "--output", "driver.onnx"]) == 0
     assert Path("driver.onnx").stat().st_size < 1_000_000
     sys.argv = [example, "driver.onnx"]
@@ -68,12 +68,17 @@ def difference_of_unit(rows: pd.DataFrame) -> float:
 
 
 def main() -> None:
-    print(*(Path(one.__file__).parent for one in (cfx, cfx_fmi, cfx_gym, cfx_onnx)))
+    print(
+        *(
+            Path(one.__file__).parent
+            for one in (cfx, cfx_drivers.fmi, cfx_drivers.gym, cfx_drivers.onnx)
+        )
+    )
     rows = platoon(sys.argv[1])
     print(f"platoon: {len(rows)} steps, speeds {rows['speed_1'].min():.2f} to", end=" ")
     print(f"{rows['speed_1'].max():.2f} m/s; unit apart {difference_of_unit(rows):.1e} m/s")
 
-    gymnasium.register_envs(cfx_gym)
+    gymnasium.register_envs(cfx_drivers.gym)
     env = gymnasium.make("cfx/CarFollowing-v0", driver=DRIVER, followers=2)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of what Gymnasium recommends
@@ -88,7 +93,7 @@ def main() -> None:
     import highway_env
 
     gymnasium.register_envs(highway_env)
-    kind = "cfx_gym.highway.CfxVehicle"
+    kind = "cfx_drivers.gym.highway.CfxVehicle"
     config = {"other_vehicles_type": kind, "simulation_frequency": 10, "vehicles_count": 10}
     env = gymnasium.make("highway-v0", config=config)
     env.reset(seed=1)

@@ -20,8 +20,8 @@ from cfx.app import application, cli
 from cfx.core import registry
 from cfx.core.errors import CfxError, ConfigError, DataError
 from cfx.data.tidy import write_tidy
-from cfx_mlflow import serve
-from cfx_mlflow.store import open_store
+from cfx.results.mlflow import serve
+from cfx.results.mlflow.store import open_store
 from tests.conftest import ROOT
 from tests.drives import straight_pairs
 

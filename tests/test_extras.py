@@ -8,48 +8,27 @@ from pathlib import Path
 import pytest
 from hydra.errors import MissingConfigException
 
+from cfx.app.nodes import distributions_text
 from cfx.app.user_errors import explain, no_command
-from cfx.core import errors, registry
+from cfx.core import distributions, registry
 from cfx.core.errors import PluginError
 from tests.conftest import ROOT
 
 
-def options_of(folder: Path) -> set[tuple[str, str]]:
-    """Returns what a plugin in this repository brings, by group and name."""
-    points = tomllib.loads((folder / "pyproject.toml").read_text("utf-8"))["project"][
-        "entry-points"
-    ]
-    found = set()
-    parts = (registry.PARTS[name] for name in ("export", "posterior", "tracker"))
-    for kind in (*registry.KINDS.values(), *parts):
-        for name in points.get(kind.entry_points, ()):
-            found.add((kind.group, name))
-    for path in folder.glob("cfx_*/conf/*/*.yaml"):
-        found.add((path.parent.name, path.stem))
-    for path in folder.glob("hydra_plugins/cfx_*_launcher.py"):
-        found.add(("hydra/launcher", path.stem.removeprefix("cfx_").removesuffix("_launcher")))
-    return found
-
-
-def test_the_table_holds_what_the_plugins_here_bring() -> None:
-    brought = {}
-    for folder in sorted((ROOT / "plugins").iterdir()):
-        if (folder / "pyproject.toml").is_file():
-            for option in options_of(folder):
-                brought[option] = folder.name
-    own = {}
-    for option, where in errors.EXTRAS.items():
-        distribution = where.partition("[")[0]
-        if distribution != errors.OWN:
-            own[option] = distribution
-    assert own == brought
+def test_the_file_holds_what_the_plugins_here_bring() -> None:
+    assert distributions.FILE.read_text("utf-8") == distributions_text(ROOT), "make conf"
+    brought = distributions.brought()
+    assert brought["model", "gipps"] == "cfx-community"
+    assert brought["experiment", "forecast"] == "cfx-forecasts"
+    assert brought["hydra/launcher", "dask"] == "cfx-dask"
+    assert brought["calibration.posterior", "sbi"] == "cfx-posteriors[sbi]"
 
 
 def test_the_extras_are_those_of_pyproject() -> None:
-    for where in errors.EXTRAS.values():
+    for where in distributions.brought().values():
         distribution, bracket, extra = where.partition("[")
         if bracket:
-            folder = ROOT if distribution == errors.OWN else ROOT / "plugins" / distribution
+            folder = ROOT if distribution == distributions.OWN else ROOT / "plugins" / distribution
             text = (folder / "pyproject.toml").read_text("utf-8")
             assert extra.rstrip("]") in tomllib.loads(text)["project"]["optional-dependencies"]
 
@@ -60,8 +39,8 @@ def test_an_option_that_is_not_installed_says_what_installs_it(
     monkeypatch.chdir(ROOT)
     error = MissingConfigException("", missing_cfg_file="model/gipps", options=["idm", "krauss"])
     said = explain(error, ["model=gipps"])
-    assert "It comes with cfx-classics: " in said
-    assert said.split(" install ")[1].startswith("--editable plugins/cfx-classics")
+    assert "It comes with cfx-community: " in said
+    assert said.split(" install ")[1].startswith("--editable plugins/cfx-community")
     error = MissingConfigException("", missing_cfg_file="hydra/launcher/joblib", options=["basic"])
     assert "--editable '.[joblib]'" in explain(error, [])
     error = MissingConfigException("", missing_cfg_file="model/gips", options=["idm"])
@@ -84,13 +63,15 @@ def test_a_kind_that_only_plugins_bring_says_which(monkeypatch: pytest.MonkeyPat
 def test_the_registry_says_it_too(monkeypatch: pytest.MonkeyPatch) -> None:
     entries = [one for one in registry.entries("optimizer") if one.name != "cma"]
     monkeypatch.setattr(registry, "entries", lambda kind: entries)
-    with pytest.raises(PluginError, match=r"optimizer=cma: .* It comes with cfx-cma: .* install"):
+    with pytest.raises(
+        PluginError, match=r"optimizer=cma: .* It comes with cfx-community: .* install"
+    ):
         registry.entry("optimizer", "cma")
 
 
 def test_outside_a_checkout_the_line_names_the_distribution(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(errors, "__file__", str(tmp_path / "cfx" / "core" / "errors.py"))
-    assert errors.install_line("cfx-cma").endswith(" install cfx-cma")
-    assert errors.install_line("cfx-driving[sumo]").endswith(' install "cfx-driving[sumo]"')
+    monkeypatch.setattr(distributions, "__file__", str(tmp_path / "cfx" / "core" / "here.py"))
+    assert distributions.install_line("cfx-community").endswith(" install cfx-community")
+    assert distributions.install_line("cfx-driving[sumo]").endswith(' install "cfx-driving[sumo]"')

@@ -26,6 +26,7 @@ FLOORS = (
     ("figures",),
     ("app",),
     ("api",),
+    ("sklearn",),
 )
 """From the ground up; a room may use rooms on its own floor and below."""
 

@@ -17,7 +17,7 @@ from packaging.utils import canonicalize_name
 import cfx
 from cfx.app import nodes
 from cfx.core import registry
-from cfx.core.errors import OWN
+from cfx.core.distributions import OWN
 
 ROOT = Path(__file__).resolve().parent.parent
 PYPROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))

@@ -16,7 +16,8 @@ from cfx.app.job.results import Upload, place_of
 from cfx.app.sweep.folder import fingerprint
 from cfx.calibration.cache import Cache
 from cfx.core import registry, storage
-from cfx.core.errors import CfxError, DataError, OutputError, install_line
+from cfx.core.distributions import install_line
+from cfx.core.errors import CfxError, DataError, OutputError
 from cfx.core.storage import RemoteFolder, is_url, local_copies, state
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.results.config import JobConfig

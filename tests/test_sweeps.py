@@ -239,7 +239,7 @@ def test_its_fingerprint_is_of_all_that_its_results_depend_on(
     found.append(fingerprint(values))
     monkeypatch.setattr(provenance, "version", lambda: "99.0")
     found.append(fingerprint(values))
-    monkeypatch.setattr(provenance, "distributions", lambda values: {"cfx-idm": "0.3"})
+    monkeypatch.setattr(provenance, "distributions", lambda values: {"cfx-community": "0.3"})
     found.append(fingerprint(values))
     assert len(set(found)) == 6
 

@@ -17,9 +17,9 @@ from types import SimpleNamespace
 import pytest
 
 from cfx.app import cli
-from cfx_mlflow.serve import _best, _over_seeds
-from cfx_mlflow.store import quiet
-from cfx_mlflow.tracker import MlflowTracker
+from cfx.results.mlflow.serve import _best, _over_seeds
+from cfx.results.mlflow.store import quiet
+from cfx.results.mlflow.tracker import MlflowTracker
 from tests.browser import Browser
 
 IMPROVEMENTS = {"krauss": 0.1234, "w99": 0.2345, "w74": -0.0567}

@@ -81,10 +81,10 @@ def _command(name: str, *arguments: str) -> int:
         PluginError: it cannot be loaded, two distributions claim its name, or its code failed.
     """
     from cfx.core import registry
-    from cfx.core.errors import EXTRAS
+    from cfx.core.distributions import brought
 
     action = ".".join((name, *arguments[:1]))
-    if action in registry.names("command") or ("command", action) in EXTRAS:
+    if action in registry.names("command") or ("command", action) in brought():
         name, arguments = action, arguments[1:]
     if name not in registry.names("command"):
         from cfx.app.user_errors import no_command

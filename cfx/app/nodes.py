@@ -2,7 +2,8 @@
 
 One function renders it for everybody: third parties' nodes on the fly (`cfx.app.hydra_source`), the
 built-in components' into `conf/<group>/<name>.yaml`, so that composing a config imports no torch.
-`make conf` (`python -m cfx.app.nodes`) writes these anew.
+`make conf` (`python -m cfx.app.nodes`) writes these anew, and which distribution of this repository
+brings the options that are not built in.
 """
 
 from __future__ import annotations
@@ -23,7 +24,8 @@ from pydantic_core import to_jsonable_python
 import cfx
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import OWN, CfxError
+from cfx.core.distributions import FILE, OWN, options_of_checkout
+from cfx.core.errors import CfxError
 from cfx.core.parameters import Parameter, ParameterSpace
 
 _WIDTH = 100
@@ -113,6 +115,22 @@ def write_all() -> int:
             path.write_text(text, encoding="utf-8")
             print(f"wrote {path}")
     return failed
+
+
+def write_distributions() -> None:
+    """Writes which distribution of this checkout brings which option (`cfx.core.distributions`)."""
+    text = distributions_text(conf_dir().parent)
+    if FILE.read_text(encoding="utf-8") != text:
+        FILE.write_text(text, encoding="utf-8")
+        print(f"wrote {FILE}")
+
+
+def distributions_text(root: Path) -> str:
+    """Returns the text of `distributions.json` for the checkout in `root`."""
+    kinds = [kind for kind in registry.KINDS.values() if kind.name != "metric"]
+    kinds += [registry.PARTS[name] for name in ("export", "posterior", "tracker")]
+    groups = {kind.entry_points: kind.group for kind in kinds}
+    return json.dumps(options_of_checkout(root, groups), indent=1) + "\n"
 
 
 def _settings(schema: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
@@ -207,4 +225,5 @@ def _scalar(value: Any) -> str:
 
 
 if __name__ == "__main__":
+    write_distributions()
     sys.exit(1 if write_all() else 0)

@@ -16,7 +16,8 @@ from omegaconf.errors import OmegaConfBaseException
 
 from cfx.app import hydra_source
 from cfx.core import registry
-from cfx.core.errors import EXTRAS, CfxError, ConfigError, advice, listed, nearest
+from cfx.core.distributions import advice, brought
+from cfx.core.errors import CfxError, ConfigError, listed, nearest
 
 
 def is_user_error(error: BaseException) -> bool:
@@ -77,7 +78,7 @@ def explain(error: BaseException, overrides: Sequence[str]) -> str:
 def no_command(word: str) -> str:
     """Returns a sentence for a word that is neither an override nor a sub-command."""
     advised = advice("command", word, registry.names("command"))
-    if ("command", word) in EXTRAS:
+    if ("command", word) in brought():
         return f"cfx {word.replace('.', ' ')} is not installed.{advised}"
     return f"{word}: neither key=value nor a sub-command.{advised} See cfx --help."
 

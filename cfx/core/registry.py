@@ -37,16 +37,8 @@ from pydantic.fields import FieldInfo
 
 from cfx.core.component import API_VERSION, Component, Settings, validate
 from cfx.core.contract import violations
-from cfx.core.errors import (
-    OWN,
-    CfxError,
-    ConfigError,
-    PluginError,
-    Terminated,
-    advice,
-    in_words,
-    nearest,
-)
+from cfx.core.distributions import OWN, advice
+from cfx.core.errors import CfxError, ConfigError, PluginError, Terminated, in_words, nearest
 from cfx.core.guest import same_environment
 
 log = logging.getLogger(__name__)

@@ -16,14 +16,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from cfx.core.errors import (
-    CfxError,
-    DataError,
-    NotInstalledError,
-    first_line,
-    install_line,
-    without_passwords,
-)
+from cfx.core.distributions import install_line
+from cfx.core.errors import CfxError, DataError, NotInstalledError, first_line, without_passwords
 from cfx.core.files import atomic_write
 
 _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}

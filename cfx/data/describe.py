@@ -15,7 +15,8 @@ from rich.console import Console, RenderableType
 from rich.table import Table
 
 from cfx.core import registry
-from cfx.core.errors import OWN, DataError, PluginError, listed
+from cfx.core.distributions import OWN
+from cfx.core.errors import DataError, PluginError, listed
 from cfx.core.files import path_override
 from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset

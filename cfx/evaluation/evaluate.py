@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.core import memory
-from cfx.core.errors import OWN, in_words
+from cfx.core.distributions import OWN
+from cfx.core.errors import in_words
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import CLUSTERS, StyleResult

@@ -74,7 +74,7 @@ class TrackingSettings(Settings):
     """Where a job is tracked."""
 
     enabled: bool = Field(True, description="log the job")
-    name: str = Field("mlflow", description="where: mlflow (cfx-mlflow), or a plugin's")
+    name: str = Field("mlflow", description="where: mlflow, or a plugin's")
     uri: str | None = Field(
         None,
         description="this job's tracking store; null: MLFLOW_TRACKING_URI, or SQLite beside the"

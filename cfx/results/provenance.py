@@ -66,7 +66,7 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
         PluginError: there is no component of that name.
     """
     from cfx.core import registry
-    from cfx.core.errors import OWN
+    from cfx.core.distributions import OWN
 
     found = {}
     for kind in registry.KINDS.values():
@@ -84,7 +84,7 @@ def metric_distributions(values: Mapping[str, Any]) -> dict[str, str]:
     Raises:
         PluginError: there is no metric of that name.
     """
-    from cfx.core.errors import OWN
+    from cfx.core.distributions import OWN
     from cfx.evaluation.metrics.base import entries_of
 
     entries = entries_of(values.get("metrics", "all"))

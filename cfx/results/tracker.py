@@ -1,4 +1,4 @@
-"""Where jobs are tracked: the door for MLflow (`cfx-mlflow`) and others."""
+"""Where jobs are tracked: what a place that keeps runs must do; MLflow is one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 from cfx.core import registry
-from cfx.core.errors import TrackingError, install_line
 from cfx.core.storage import is_url, local_folder
 from cfx.policies.ready import folder_of_ready_made, is_ready_made
 
@@ -130,38 +129,21 @@ def tracked(config: JobConfig, folder: Path) -> Iterator[Tracker]:
     """Opens the run of a job, if the configuration asks for one; as `Tracking.run`.
 
     Raises:
-        PluginError: the tracking that it names is not installed. Without `cfx-mlflow` a job that
-            names none is not tracked, and says so.
+        PluginError: the tracking that it names is not installed.
     """
-    name = config.tracking.name
     if not config.tracking.enabled:
         yield Tracker()
-    elif name == MLFLOW and name not in registry.names("tracker"):
-        log.warning(
-            "This job is not tracked: MLflow comes with cfx-mlflow: %s; or tracking.enabled=false",
-            install_line("cfx-mlflow"),
-        )
-        yield Tracker()
     else:
-        with tracking_named(name).run(config, folder) as tracker:
+        with tracking_named(config.tracking.name).run(config, folder) as tracker:
             yield tracker
 
 
 def tracking_of_run(text: str) -> Tracking:
-    """Returns the first tracking of whose runs this could be the id; MLflow where it is none's.
-
-    Raises:
-        TrackingError: no tracking is installed.
-    """
+    """Returns the first tracking of whose runs this could be the id; MLflow where it is none's."""
     installed = {name: tracking_named(name) for name in registry.names("tracker")}
     for tracking in installed.values():
         if tracking.is_run_id(text):
             return tracking
-    if MLFLOW not in installed:
-        raise TrackingError(
-            f"'{text}' is no job's output folder; to name a job by its run in MLflow:"
-            f" {install_line('cfx-mlflow')}"
-        )
     return installed[MLFLOW]
 
 

@@ -12,7 +12,7 @@ import cfx.api
 from cfx.core import registry
 
 MODULES = [one.name for one in pkgutil.iter_modules(cfx.api.__path__, "cfx.api.")]
-MODULES.append("cfx_sklearn.regressor")
+MODULES.append("cfx.sklearn")
 
 
 @pytest.fixture(autouse=True)

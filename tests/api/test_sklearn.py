@@ -13,7 +13,7 @@ from sklearn.utils import estimator_checks
 
 import cfx
 from cfx.core.errors import ConfigError, DataError
-from cfx_sklearn import CarFollowingRegressor
+from cfx.sklearn import CarFollowingRegressor
 
 CHECKS = (
     "check_do_not_raise_errors_in_init_or_set_params",

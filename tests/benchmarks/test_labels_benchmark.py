@@ -20,6 +20,7 @@ from botorch.optim import optimize_acqf
 from gpytorch.mlls import ExactMarginalLogLikelihood
 from torch import Tensor
 
+from cfx.calibration.botorch import BotorchOptimizer
 from cfx.calibration.gradient_search import GradientSearch
 from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.random_search import RandomSearch
@@ -29,7 +30,6 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Segments, Start
-from cfx_botorch.optimizer import BotorchOptimizer
 
 WINDOWS, STEPS, DT, LOOPED = 128, 5, 0.1, 4
 

@@ -26,7 +26,7 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import Compile, MemoryStepper, can_compile
 from cfx.simulation.trajectory import Start
-from cfx_classics.w74 import W74
+from cfx_community.models.w74 import W74
 
 numba = pytest.importorskip("numba")
 

@@ -11,6 +11,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.calibration.botorch import BotorchOptimizer
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.gradient_search import GradientSearch
@@ -32,7 +33,6 @@ from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Windows, WindowSettings
-from cfx_botorch.optimizer import BotorchOptimizer
 from tests.drives import straight_pairs, wavy_pairs
 
 SETTINGS = WindowSettings()

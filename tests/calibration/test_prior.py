@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.calibration.botorch import BotorchOptimizer
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.gradient_search import GradientSearch
@@ -23,7 +24,6 @@ from cfx.data.pairs import PairBatch
 from cfx.models.base import Follower, Leader
 from cfx.models.idm import IDM
 from cfx.simulation.rollout import MemoryStepper
-from cfx_botorch.optimizer import BotorchOptimizer
 from tests.drives import wavy_pairs
 
 MODEL = IDM()

@@ -312,7 +312,7 @@ def test_a_table_that_fits_no_memory_is_refused(
 
 @pytest.mark.filterwarnings("ignore:.*Any type hint")
 def test_mlflow_serves_a_policy_only_from_its_weights(folder: Path) -> None:
-    from cfx_mlflow.served_policy import ServedPolicy
+    from cfx.results.mlflow.served_policy import ServedPolicy
 
     class Context:
         artifacts = {"policy": str(folder / "policy")}  # noqa: RUF012 - MLflow's has it so

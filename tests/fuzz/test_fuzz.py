@@ -28,7 +28,7 @@ from cfx.data.describe import describe
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
-from cfx_mlflow.tracker import MlflowTracker
+from cfx.results.mlflow.tracker import MlflowTracker
 from cfx_recordings.ngsim import NgsimDataset
 from tests.agents import adaptive
 from tests.drives import straight_pairs

@@ -16,7 +16,7 @@ from cfx.models.krauss import Krauss
 from cfx.models.limits import LimitSettings, at_limits, limited_speed
 from cfx.models.w99 import W99
 from cfx.simulation.step import advance_vehicle
-from cfx_classics.w74 import W74
+from cfx_community.models.w74 import W74
 
 DT = 0.1
 speeds = st.floats(0.0, 60.0)

@@ -9,7 +9,7 @@ from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.regimes import below, up_to
 from cfx.models.w99 import W99
-from cfx_classics.w74 import W74
+from cfx_community.models.w74 import W74
 
 numbers = st.floats(-50.0, 50.0)
 

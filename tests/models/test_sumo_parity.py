@@ -26,7 +26,7 @@ from cfx.models.vtype import InSumo, VType
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import simulate
 from cfx.simulation.trajectory import Start, Trajectory
-from cfx_classics.w74 import W74
+from cfx_community.models.w74 import W74
 from cfx_sumo.idm import IdmSumo
 from cfx_sumo.krauss import KraussSumo
 from tests.forks import Forks
@@ -159,7 +159,7 @@ def sumos_krauss(rng: np.random.Generator, count: int) -> list[Values]:
 
 def plugins_idm() -> Twin | None:
     """The plugin's `idm`: no brake cap (lifted in SUMO here), and other gaps below 0.1 m."""
-    if importlib.util.find_spec("cfx_idm") is None:
+    if importlib.util.find_spec("cfx_community") is None:
         return None
     from cfx.models.idm import IDM
 
@@ -182,7 +182,9 @@ def plugins_idm() -> Twin | None:
     def same(follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> Tensor:
         return bumper_gap(follower, leader) >= 0.1
 
-    return Twin("idm (cfx-idm) / IDM", IDM(limits=None), anywhere(IDM()), same=same, vtype=vtype)
+    return Twin(
+        "idm (cfx-community) / IDM", IDM(limits=None), anywhere(IDM()), same=same, vtype=vtype
+    )
 
 
 PLUGINS_IDM = plugins_idm()

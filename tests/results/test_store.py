@@ -11,8 +11,8 @@ from pathlib import Path
 import pytest
 
 from cfx.core.errors import TrackingError
-from cfx_mlflow import store
-from cfx_mlflow.store import open_store, tracking_uri
+from cfx.results.mlflow import store
+from cfx.results.mlflow.store import open_store, tracking_uri
 
 
 @pytest.fixture(autouse=True)

@@ -33,12 +33,12 @@ from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.base import DirectHead
 from cfx.results import provenance
 from cfx.results.config import JobConfig
+from cfx.results.mlflow.store import download_run, quiet, translate_errors
+from cfx.results.mlflow.tracker import CURVE_POINTS, MlflowTracker, sweep_link
 from cfx.results.table import Findings, Kept, ResultTable, WrittenTable
 from cfx.results.tables import Pairs
 from cfx.results.tracker import tracked
 from cfx.simulation.windows import WindowSettings
-from cfx_mlflow.store import download_run, quiet, translate_errors
-from cfx_mlflow.tracker import CURVE_POINTS, MlflowTracker, sweep_link
 from tests.drives import wavy_pairs
 from tests.forks import Forks
 from tests.made_up import MadeUp, make_curves, make_results
@@ -321,7 +321,7 @@ def test_a_run_whose_process_is_gone_is_closed(uri: str, client: Any) -> None:
 JOB = """
 import sys, warnings
 warnings.simplefilter("error")
-from cfx_mlflow.tracker import MlflowTracker
+from cfx.results.mlflow.tracker import MlflowTracker
 uri, seed = sys.argv[1:]
 sweep = "a sweep'of/many"
 with MlflowTracker.run(uri, run_name=f"job {seed}", parameters={"seed": seed}, sweep=sweep) as run:
@@ -334,7 +334,7 @@ def test_two_processes_begin_a_sweep_at_once(tmp_path: Path) -> None:
     uri = f"sqlite:///{tmp_path}/new/deeper/mlflow.db"
     (tmp_path / "forks").mkdir()
     # Connections are made by each process: the one they come from only imports.
-    with Forks("import mlflow, cfx_mlflow.tracker", tmp_path / "forks") as forks:
+    with Forks("import mlflow, cfx.results.mlflow.tracker", tmp_path / "forks") as forks:
         jobs = [forks.start(["-c", JOB, uri, str(k)], tmp_path) for k in range(2)]
         codes = [job.wait() for job in jobs]
     said = [job.out.read_text() + job.error.read_text() for job in jobs]
@@ -552,15 +552,16 @@ def test_plugins_are_named_with_their_versions(
             return real(kind, name)
         plugin = kind == "model"
         return SimpleNamespace(
-            distribution="cfx-idm" if plugin else "cfx-driving", version="0.3" if plugin else "0.1"
+            distribution="cfx-community" if plugin else "cfx-driving",
+            version="0.3" if plugin else "0.1",
         )
 
     monkeypatch.setattr(registry, "entry", entry)
     with tracked(config_of(uri), tmp_path) as run:
         pass
     tags = client.get_run(run.run_id).data.tags
-    assert (tags["cfx.plugins"], tags["cfx.plugin.cfx-idm"]) == ("cfx-idm 0.3", "0.3")
-    assert provenance.distributions({"model": {"name": "krauss"}}) == {"cfx-idm": "0.3"}
+    assert (tags["cfx.plugins"], tags["cfx.plugin.cfx-community"]) == ("cfx-community 0.3", "0.3")
+    assert provenance.distributions({"model": {"name": "krauss"}}) == {"cfx-community": "0.3"}
 
 
 def test_the_commit_of_the_users_checkout(tmp_path: Path) -> None:

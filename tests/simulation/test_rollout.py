@@ -17,7 +17,7 @@ from cfx.models.w99 import W99
 from cfx.simulation import rollout
 from cfx.simulation.rollout import MemoryStepper, can_compile, simulate
 from cfx.simulation.trajectory import Start, Trajectory
-from cfx_classics.w74 import W74
+from cfx_community.models.w74 import W74
 
 DT = 0.1
 MODELS = [Krauss(), W99(), W74()]

@@ -6,11 +6,11 @@ from dataclasses import replace
 
 import pytest
 import torch
+from tests.policies.test_estimators import ESTIMATORS, agent_of
 
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
-from cfx_estimators.estimator import EstimatorPolicy
-from tests.policies.test_estimators import ESTIMATORS, agent_of
+from cfx_community.policies.estimator import EstimatorPolicy
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 

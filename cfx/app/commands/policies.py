@@ -18,7 +18,7 @@ class PoliciesCommand(Command):
         made = argparse.ArgumentParser(
             "cfx policies",
             description="Lists the ready-made policies that come with cfx.",
-            epilog="cfx policies make, of the distribution cfx-benchmark, trains them anew.",
+            epilog="cfx policies make, of the distribution cfx-report, trains them anew.",
         )
         actions = made.add_subparsers(dest="action")
         show = actions.add_parser("show", help="the card of a policy: what it knows, and how well")

@@ -23,8 +23,9 @@ from cfx.calibration.posterior import posterior_method
 from cfx.calibration.settings import CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.core import registry
+from cfx.core.distributions import OWN
 from cfx.core.engine import Engine
-from cfx.core.errors import OWN, ConfigError, PluginError
+from cfx.core.errors import ConfigError, PluginError
 from cfx.core.memory import require_memory
 from cfx.core.storage import is_url
 from cfx.core.threads import limit_cores, set_threads

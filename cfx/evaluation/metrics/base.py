@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import OWN, PluginError
+from cfx.core.distributions import OWN
+from cfx.core.errors import PluginError
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -2,7 +2,7 @@
 
 Each is a folder with a policy, its card (`card.json`, and `CARD.md` for people) and the metrics of
 the job that tested it on unseen drivers (`metrics.json`). `cfx policies make`, which comes with the
-distribution cfx-benchmark, makes them.
+distribution cfx-report, makes them.
 """
 
 from __future__ import annotations

@@ -19,7 +19,8 @@ from cfx.app.completion import add_kind
 from cfx.core import registry
 from cfx.core.command import Command
 from cfx.core.component import API_VERSION
-from cfx.core.errors import OWN, ConfigError, OutputError, PluginError
+from cfx.core.distributions import OWN
+from cfx.core.errors import ConfigError, OutputError, PluginError
 
 _TEMPLATE = Path(__file__).parent / "template"
 

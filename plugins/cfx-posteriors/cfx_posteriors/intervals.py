@@ -20,7 +20,8 @@ from cfx.calibration.losses import SegmentLosses
 from cfx.calibration.posterior import DriverPosteriors, PosteriorMethod
 from cfx.calibration.settings import LEVEL, CalibrationSettings
 from cfx.calibration.shards import Solver
-from cfx.core.errors import NotInstalledError, install_line
+from cfx.core.distributions import install_line
+from cfx.core.errors import NotInstalledError
 from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
 from cfx.simulation.trajectory import Segments

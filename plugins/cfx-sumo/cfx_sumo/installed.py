@@ -8,7 +8,8 @@ from __future__ import annotations
 import importlib.metadata
 import re
 
-from cfx.core.errors import NotInstalledError, SumoError, install_line
+from cfx.core.distributions import install_line
+from cfx.core.errors import NotInstalledError, SumoError
 
 DISTRIBUTION = "cfx-sumo"
 """What brings SUMO."""

@@ -11,7 +11,8 @@ from typing import Any
 import pytest
 
 from cfx.app.cli import main
-from cfx.core.errors import ConfigError, install_line
+from cfx.core.distributions import install_line
+from cfx.core.errors import ConfigError
 from cfx.policies.checkpoint import save
 from cfx_sumo.demo.motorway import SHIPPED
 from cfx_sumo.drive.run import Collision, ScenarioRun, Tally, parse_drivers, report

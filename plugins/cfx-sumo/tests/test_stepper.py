@@ -15,7 +15,7 @@ from cfx.core.errors import ConfigError, SumoError
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
-from cfx_classics.w74 import W74
+from cfx_community.models.w74 import W74
 from cfx_contracts import check_contract
 from cfx_sumo.simulation.simulator import SumoSimulator
 from cfx_sumo.simulation.stepper import require_in_sumo

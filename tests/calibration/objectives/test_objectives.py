@@ -17,7 +17,8 @@ from cfx.calibration.mixed import Mixed
 from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.calibration.theil_u import TheilU
 from cfx.core import registry
-from cfx.core.errors import OWN, ConfigError
+from cfx.core.distributions import OWN
+from cfx.core.errors import ConfigError
 from cfx_contracts import check_contract
 
 SHIPPED = {

@@ -22,8 +22,10 @@ def test_code_is_known_of_cfx_and_of_every_plugin() -> None:
 
 
 def test_what_one_alone_has_is_no_difference() -> None:
-    here = {"cfx-driving": "a", "cfx-idm": "b", "mine": "c"}
-    assert differing(here, {"cfx-driving": "a", "cfx-idm": "x", "theirs": "d"}) == ["cfx-idm"]
+    here = {"cfx-driving": "a", "cfx-community": "b", "mine": "c"}
+    assert differing(here, {"cfx-driving": "a", "cfx-community": "x", "theirs": "d"}) == [
+        "cfx-community"
+    ]
     assert differing(here, here) == []
 
 

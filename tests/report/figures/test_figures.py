@@ -12,7 +12,7 @@ import pytest
 from matplotlib import pyplot as plt
 
 from cfx.core import registry
-from cfx.core.errors import OWN
+from cfx.core.distributions import OWN
 from cfx.figures.canvas import canvas, hover
 from cfx.figures.figure import JobFigure, Results, draw, write_figure, write_figures
 from cfx_report.inline import PLACE, inline_svg

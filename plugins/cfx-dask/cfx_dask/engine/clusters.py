@@ -12,7 +12,8 @@ import uuid
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cfx.core.errors import EngineError, NotInstalledError, install_line
+from cfx.core.distributions import install_line
+from cfx.core.errors import EngineError, NotInstalledError
 from cfx.core.threads import cores
 from cfx_dask.engine.settings import DaskSettings
 

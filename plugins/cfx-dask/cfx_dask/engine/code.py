@@ -8,7 +8,7 @@ import importlib.util
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from cfx.core.errors import OWN
+from cfx.core.distributions import OWN
 from cfx.core.registry import KINDS, entries
 
 

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cfx.core.errors import OWN
+from cfx.core.distributions import OWN
 from cfx.core.registry import installed
 from cfx.data.style import ALL, name_of_indicator
 from cfx.evaluation.result import Purpose

@@ -12,7 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
-from cfx.core.errors import ConfigError, SumoError, install_line, nearest
+from cfx.core.distributions import install_line
+from cfx.core.errors import ConfigError, SumoError, nearest
 from cfx.models.vtype import VType
 from cfx_sumo.installed import DISTRIBUTION
 

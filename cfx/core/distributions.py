@@ -1,0 +1,133 @@
+"""Which distribution brings an option, and the command that installs it.
+
+`distributions.json` names the options of the distributions in this repository. `make conf` writes
+it from their `pyproject.toml` files, so a plugin that gains a component changes no file of cfx.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import shutil
+import sys
+import tomllib
+from collections.abc import Mapping, Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from cfx.core.errors import nearest
+
+OWN = "cfx-driving"
+"""cfx's own distribution: no other can replace its components."""
+
+FILE = Path(__file__).with_name("distributions.json")
+
+
+@cache
+def brought() -> Mapping[tuple[str, str], str]:
+    """Returns what brings each option that is not cfx's own, by its group and name.
+
+    It is a distribution, or an extra of one: `cfx-sumo`, `cfx-driving[joblib]`.
+    """
+    options = {}
+    for wanted, groups in json.loads(FILE.read_text(encoding="utf-8")).items():
+        for group, names in groups.items():
+            for name in names:
+                options[group, name] = wanted
+    return options
+
+
+def options_of_checkout(root: Path, groups: Mapping[str, str]) -> dict[str, dict[str, list[str]]]:
+    """Returns what each distribution of a checkout brings: names of options by group.
+
+    Components and sub-commands stand in the entry points, other options in the files of `conf/`.
+    A launcher of Hydra is a module of the namespace `hydra_plugins`. Options that need an extra
+    stand in the table `tool.cfx.extras` of `pyproject.toml`.
+
+    Args:
+        root: folder of the checkout.
+        groups: the config group of each entry-point group whose names a user writes.
+    """
+    table: dict[str, dict[str, list[str]]] = {}
+    for file in (root / "pyproject.toml", *sorted(root.glob("plugins/*/pyproject.toml"))):
+        content = tomllib.loads(file.read_text(encoding="utf-8"))
+        distribution = content["project"]["name"]
+        options: dict[str, list[str]] = {}
+        if distribution != OWN:
+            options = _options_of_plugin(file.parent, content["project"], groups)
+        extras = content.get("tool", {}).get("cfx", {}).get("extras", {})
+        for extra, more in extras.items():
+            table[f"{distribution}[{extra}]"] = more
+            for group, names in more.items():
+                options[group] = [name for name in options.get(group, []) if name not in names]
+        table[distribution] = {group: sorted(names) for group, names in options.items() if names}
+    return {
+        wanted: dict(sorted(table[wanted].items())) for wanted in sorted(table) if table[wanted]
+    }
+
+
+def _options_of_plugin(
+    folder: Path, project: Mapping[str, Any], groups: Mapping[str, str]
+) -> dict[str, list[str]]:
+    options: dict[str, list[str]] = {}
+    for entry_points, names in project.get("entry-points", {}).items():
+        if entry_points in groups:
+            options.setdefault(groups[entry_points], []).extend(names)
+    for preset in folder.glob("cfx_*/conf/*/*.yaml"):
+        options.setdefault(preset.parent.name, []).append(preset.stem)
+    for launcher in folder.glob("hydra_plugins/cfx_*_launcher.py"):
+        name = launcher.stem.removeprefix("cfx_").removesuffix("_launcher")
+        options.setdefault("hydra/launcher", []).append(name)
+    return options
+
+
+def advice(group: str, name: str, known: Sequence[str]) -> str:
+    """Returns advice on a missing option: install it, or choose another.
+
+    Args:
+        group: such as `model`.
+        name: what was asked for.
+        known: the options that are installed.
+    """
+    options = brought()
+    if (group, name) in options:
+        wanted = options[group, name]
+        return f" It comes with {wanted}: {install_line(wanted)}"
+    others = [option for where, option in options if where == group]
+    text = nearest(name, [*known, *others])
+    if known:
+        text += f" Known: {', '.join(known)}."
+    return text
+
+
+def install_line(wanted: str) -> str:
+    """Returns the command that installs a distribution, or an extra of cfx's, for this Python.
+
+    In a checkout it is the folder's: `pip install --editable plugins/cfx-classics`.
+    """
+    name, bracket, extra = wanted.partition("[")
+    checkout = Path(__file__).resolve().parents[2]
+    if name != OWN:
+        checkout = checkout / "plugins" / name
+    source = shlex.quote(wanted)
+    if bracket:
+        source = f'"{wanted}"'
+    if (checkout / "pyproject.toml").is_file():
+        source = f"--editable {shlex.quote(_from_here(checkout) + bracket + extra)}"
+    return f"{_pip()} install {source}"
+
+
+def _pip() -> str:
+    """Returns `pip`, or how to call this Python's where the shell has another."""
+    found = shutil.which("pip")
+    if found is not None and Path(found).parent == Path(sys.executable).parent:
+        return "pip"
+    return f"{shlex.quote(_from_here(Path(sys.executable)))} -m pip"
+
+
+def _from_here(path: Path) -> str:
+    """Returns a path from the working directory on, if it lies there, else the whole one."""
+    inside = path.is_relative_to(Path.cwd())
+    return os.path.relpath(path) if inside else str(path)

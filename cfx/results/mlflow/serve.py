@@ -1,0 +1,358 @@
+"""Opens the tracked jobs in MLflow's own user interface, reachable from this machine only."""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import os
+import socket
+import subprocess
+import sys
+import time
+import urllib.request
+import webbrowser
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from cfx.core.errors import ConfigError, TrackingError
+from cfx.evaluation.headline import PERCENT, RESULT, SPEED_ERROR
+
+if TYPE_CHECKING:
+    from mlflow import MlflowClient
+
+HOST = "127.0.0.1"
+
+SWEEPS = 3
+"""How many sweeps, the newest, are listed."""
+
+JOBS = 3
+"""How many jobs that belong to no sweep, the newest, are listed."""
+
+COMPARED = 10
+"""Most jobs on one page that compares them side by side; the best of a larger sweep."""
+
+IMPROVEMENT = "metrics.`rmse_improvement/mean`"
+"""What the tables of jobs are sorted by."""
+
+_COLUMNS = (
+    "tags.`model`",
+    "tags.`policy`",
+    "tags.`learner`",
+    f"tags.`{RESULT}`",
+    f"metrics.`{PERCENT}`",
+    f"metrics.`{SPEED_ERROR}`",
+    "metrics.`collisions/policy`",
+    IMPROVEMENT,
+    "metrics.`rmse_speed/fixed`",
+    "metrics.`rmse_speed/default`",
+    "tags.`protocol`",
+    "tags.`data`",
+    "tags.`optimizer`",
+    "tags.`objective`",
+    "tags.`style.cluster`",
+    "tags.`seed`",
+)
+"""Columns of those tables: what it is, and the improvement with its interval, come first."""
+
+_WIDTHS = {
+    "tags.`model`": 84,
+    "tags.`policy`": 64,
+    "tags.`learner`": 84,
+    f"tags.`{RESULT}`": 260,
+}
+"""Pixels of columns that need more or less than MLflow gives them."""
+
+_CHARTS = f"{PERCENT}|{SPEED_ERROR}|rmse_improvement/mean|rmse_speed/"
+"""Metrics that MLflow's charts show, a regular expression."""
+
+_SECTION = "cfx"
+
+_FIRST_CHARTS = (
+    {"uuid": "cfx-improvement", "type": "BAR", "metricKey": PERCENT, "runsCountToCompare": 20},
+    {
+        "uuid": "cfx-difference",
+        "type": "DIFFERENCE",
+        "chartName": "Settings that differ",
+        "compareGroups": ["Parameters"],
+        "showChangeFromBaseline": False,
+        "showDifferencesOnly": True,
+        "baselineColumnUuid": "",
+        "runsCountToCompare": 10,
+    },
+)
+"""Charts that come before those that MLflow makes of every metric."""
+
+_READY_S = 120.0
+"""How long the server may take to answer, s."""
+
+
+def serve(uri: str | None, port: int, *, open_browser: bool = False) -> None:
+    """Starts MLflow's server on a tracking store and prints the links.
+
+    This process becomes the server until Ctrl-C. Runs that a killed process left RUNNING are closed
+    first. The columns of the linked tables are kept in the store.
+
+    Args:
+        uri: of the store; None for `MLFLOW_TRACKING_URI`, else the database beside the outputs.
+        port: of the server, on 127.0.0.1.
+        open_browser: open the first link in the user's browser, as soon as the server answers.
+
+    Raises:
+        ConfigError: the port is taken.
+        TrackingError: the store does not exist or cannot be read.
+    """
+    store = _store(uri)
+    if store.startswith(("http://", "https://")):
+        print(f"the tracking store is a server already; open {store}")
+        return
+    _check_port(port)
+    _close_abandoned(store)
+    lines = _links(store, port)
+    for line in lines:
+        print(line, flush=True)
+    if open_browser:
+        _open_later(port, _first_link(lines))
+    _become_server(store, port)
+
+
+def _first_link(lines: Sequence[str]) -> str:
+    words = " ".join(lines).split()
+    return next(word for word in words if word.startswith("http://"))
+
+
+def _become_server(store: str, port: int) -> None:
+    """Puts MLflow's server in this process's place, so that signals and exit codes are its own."""
+    command = [sys.executable, "-m", "mlflow", "ui", "--host", HOST, "--port", str(port)]
+    command += ["--workers", "1", "--backend-store-uri", store]
+    environment = {
+        **os.environ,
+        "PYTHONWARNINGS": "ignore",  # MLflow's own libraries warn of each other
+        "MLFLOW_DISABLE_TELEMETRY": "true",
+        "MLFLOW_SERVER_ENABLE_JOB_EXECUTION": "false",
+    }
+    os.execve(sys.executable, command, environment)  # noqa: S606 - no shell is wanted
+
+
+def open_when_ready(port: str, link: str) -> None:
+    """Opens a link in the user's browser once MLflow's server answers at `port`.
+
+    Gives up silently after two minutes.
+    """
+    end = time.monotonic() + _READY_S
+    while time.monotonic() < end:
+        try:
+            with urllib.request.urlopen(f"http://{HOST}:{port}/health", timeout=5):
+                webbrowser.open(link)
+                return
+        except OSError:
+            time.sleep(0.2)
+
+
+def _open_later(port: int, link: str) -> None:
+    code = (
+        "import sys; from cfx.results.mlflow.serve import open_when_ready;"
+        " open_when_ready(*sys.argv[1:])"
+    )
+    command = [sys.executable, "-c", code, str(port), link]
+    subprocess.Popen(command)  # noqa: S603 - this interpreter, and what is written above
+
+
+def _store(uri: str | None) -> str:
+    from cfx.results.mlflow.store import absolute_uri, check_database, sqlite_file, tracking_uri
+
+    store = tracking_uri(None)
+    if uri:
+        store = absolute_uri(uri, "--uri")
+    file = sqlite_file(store)
+    if file is not None and not file.is_file():
+        raise TrackingError(
+            f"{file} does not exist: no job has been tracked from here;"
+            " run one, or name its store with --uri"
+        )
+    if file is not None:
+        check_database(file, store)
+    return store
+
+
+def _check_port(port: int) -> None:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((HOST, port))
+        except (OSError, OverflowError) as error:
+            raise ConfigError(f"--port {port} cannot be used ({error}); choose another") from None
+
+
+def _client(store: str) -> MlflowClient:
+    from mlflow import MlflowClient
+
+    return MlflowClient(store)
+
+
+def _close_abandoned(store: str) -> None:
+    """Marks runs KILLED that a killed process left RUNNING."""
+    from cfx.results.mlflow.store import open_store, translate_errors
+    from cfx.results.mlflow.tracker import close_abandoned
+
+    with translate_errors(f"close abandoned runs in {store}"):
+        names = [one.name for one in _client(store).search_experiments()]
+        for name in names:
+            opened = open_store(store, name)
+            with opened.locked():
+                close_abandoned(opened)
+
+
+def _links(store: str, port: int) -> list[str]:
+    """Returns what to print: the newest sweeps and single jobs, and a page per experiment."""
+    from cfx.results.mlflow.store import translate_errors
+
+    with translate_errors(f"read {store}"):
+        client = _client(store)
+        names = {}
+        for experiment in client.search_experiments():
+            names[str(experiment.experiment_id)] = str(experiment.name)
+        newest = ["attributes.start_time DESC"]
+        sweeps = client.search_runs(
+            list(names), "tags.`cfx.sweep_parent` LIKE '%'", order_by=newest, max_results=SWEEPS
+        )
+        alone = "tags.`cfx.sweep` IS NULL and tags.`cfx.sweep_parent` IS NULL"
+        jobs = client.search_runs(list(names), alone, order_by=newest, max_results=JOBS)
+        address = f"http://{HOST}:{port}/"
+        lines = []
+        for sweep in sweeps:
+            lines += _sweep_lines(client, sweep, address)
+        for job in jobs:
+            page = f"#/experiments/{job.info.experiment_id}/runs/{job.info.run_id}"
+            lines.append(f"job {job.info.run_name}, {_began(job)}{_improvement(job)}")
+            lines.append(f"  page:    {address}{page}?workflowType=machine_learning")
+        lines += _experiment_lines(client, names, address)
+        return lines
+
+
+def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
+    experiment, name = str(parent.info.experiment_id), parent.data.tags["cfx.sweep_parent"]
+    chosen = f"tags.`cfx.sweep` = '{name}'"
+    jobs = client.search_runs(
+        [experiment], chosen, order_by=[f"{IMPROVEMENT} DESC"], max_results=1000
+    )
+    groups = _over_seeds(jobs)
+    found = list(itertools.chain.from_iterable(groups))
+    table = _shared_view(client, experiment, chosen)
+    title = f"sweep {name}, {_began(parent)}: {len(found)} jobs"
+    if groups:
+        title += _best(groups[0])
+    lines = [
+        title,
+        f"  table:   {address}{table}",
+        f"  charts:  {address}{table}&compareRunsMode=CHART",
+    ]
+    if len(found) > 1:
+        ids = [str(run.info.run_id) for run in found[:COMPARED]]
+        line = f"  compare: {address}{_compare_page(experiment, ids)}"
+        if len(found) > COMPARED:
+            line += f" (the best {COMPARED})"
+        lines.append(line)
+    return lines
+
+
+def _over_seeds(runs: Sequence[Any]) -> list[list[Any]]:
+    """Returns the runs, those that differ in the seed alone together, the best mean first.
+
+    A single seed that was lucky so comes before no setting that is better on average.
+    """
+    groups: dict[tuple[tuple[str, str], ...], list[Any]] = {}
+    for run in runs:
+        settings = {key: value for key, value in run.data.params.items() if key != "seed"}
+        groups.setdefault(tuple(sorted(settings.items())), []).append(run)
+    return sorted(groups.values(), key=_mean_improvement, reverse=True)
+
+
+def _improvements(runs: Sequence[Any]) -> list[float]:
+    """Returns the improvements of those runs that have one."""
+    values = []
+    for run in runs:
+        value = run.data.metrics.get("rmse_improvement/mean", math.nan)
+        if math.isfinite(value):
+            values.append(value)
+    return values
+
+
+def _mean_improvement(runs: Sequence[Any]) -> float:
+    """Returns the runs' mean improvement, minus infinity if none has one."""
+    values = _improvements(runs)
+    return sum(values) / len(values) if values else -math.inf
+
+
+def _best(runs: Sequence[Any]) -> str:
+    """Returns the improvement of the best setting, over its seeds if there are several."""
+    values = _improvements(runs)
+    if len(values) < 2:
+        return _improvement(runs[0], "best ")
+    return f", best improvement {_mean_improvement(runs):.1%} (mean of {len(values)} seeds)"
+
+
+def _experiment_lines(client: MlflowClient, names: dict[str, str], address: str) -> list[str]:
+    """Returns a page for each experiment that holds jobs, or for each if none does."""
+    used = [one for one in names if client.search_runs([one], max_results=1)]
+    lines = []
+    for experiment in used or names:
+        page = _shared_view(client, experiment, "tags.`cfx.sweep_parent` IS NULL")
+        lines.append(
+            f"all jobs of experiment {names[experiment]}, the best first\n"
+            f"  table:   {address}{page}"
+        )
+    return lines
+
+
+def _shared_view(client: MlflowClient, experiment: str, chosen: str) -> str:
+    """Keeps a view of the table of runs in the store, the best run first, and returns its page.
+
+    MLflow hides metrics until a user picks columns; only a "shared view", a tag of the experiment,
+    carries columns in a link. The page comes without the server's address.
+
+    Args:
+        chosen: MLflow's search for the runs to show.
+    """
+    widths = dict(_WIDTHS)
+    for column in _COLUMNS:
+        if column.startswith("metrics"):
+            widths[column] = 8 * len(column) - 40
+    section = {"uuid": _SECTION, "name": "Improvement", "display": True}
+    always = {"deleted": False, "isGenerated": False}
+    charts = [{**chart, "metricSectionId": _SECTION, **always} for chart in _FIRST_CHARTS]
+    view = {
+        "searchFilter": chosen,
+        "orderByKey": IMPROVEMENT,  # sorted by date, MLflow would fold jobs away under their sweep
+        "orderByAsc": False,
+        "selectedColumns": list(_COLUMNS),
+        "columnOrder": list(_COLUMNS),
+        "columnWidths": widths,
+        "chartsSearchFilter": _CHARTS,
+        "isAccordionReordered": True,  # else MLflow sorts the sections by their names
+        "compareRunSections": [{**section, "isReordered": False, **always}],
+        "compareRunCharts": charts,
+    }
+    key = "cfx-" + hashlib.sha256(chosen.encode()).hexdigest()[:12]
+    client.set_experiment_tag(experiment, f"mlflow.sharedViewState.{key}", json.dumps(view))
+    return f"#/experiments/{experiment}/runs?viewStateShareKey={key}&workflowType=machine_learning"
+
+
+def _compare_page(experiment: str, ids: Sequence[str]) -> str:
+    runs = quote(json.dumps(list(ids), separators=(",", ":")))
+    experiments = quote(json.dumps([experiment], separators=(",", ":")))
+    return f"#/compare-runs?runs={runs}&experiments={experiments}"
+
+
+def _began(run: Any) -> str:
+    return time.strftime("%Y-%m-%d %H:%M", time.localtime(run.info.start_time / 1000))
+
+
+def _improvement(run: Any, which: str = "") -> str:
+    """Returns a run's improvement in words; how the run ended if it has none."""
+    value = run.data.metrics.get("rmse_improvement/mean")
+    if value is None or math.isnan(value):
+        return f", {run.info.status}"
+    return f", {which}improvement {value:.1%}"

@@ -1,0 +1,167 @@
+"""Calibration as a scikit-learn estimator, for its cross-validation and its searches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Self
+
+import numpy as np
+import pandas as pd
+import torch
+from numpy.typing import ArrayLike, NDArray
+from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.utils import Tags
+from sklearn.utils.validation import check_is_fitted
+from torch import Tensor
+
+from cfx import simulate
+from cfx.api.experiment import config
+from cfx.api.pairs import Pairs, read
+from cfx.app.job import steps
+from cfx.calibration.identifiability import losses_of
+from cfx.core.errors import DataError
+from cfx.core.guest import visit
+from cfx.evaluation.protocols.base import ProtocolContext
+from cfx.simulation.windows import Split
+
+_SHORTEST = 2
+"""Frames of the shortest pair that is read: every row of a table counts."""
+
+
+class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc] # no types
+    """Pooled calibration of a driving model: fitted on some drivers, it predicts others' speeds.
+
+    A sample is a row of a table in the tidy layout: one frame of one pair. Rows of a pair belong
+    together: split them by `groups`, as `GroupKFold` does.
+
+    Of scikit-learn's `check_estimator` those checks apply, and pass, that are about parameters,
+    cloning, tags and representation. Those that feed arrays of random numbers do not: a row without
+    its pair and its time is no trajectory. The tag `two_d_array=False` says so.
+
+    Args:
+        model: as after `model=`.
+        objective: what is minimised, as after `objective=`.
+        seed: the same seed gives the same parameters.
+        settings: others of the command line, by key: `{"optimizer": "random"}`.
+
+    Attributes:
+        parameters_: the pooled parameters, SI units.
+        feature_names_in_: columns of the table.
+        n_features_in_: how many there are.
+
+    Examples:
+        >>> import cfx
+        >>> from cfx.sklearn import CarFollowingRegressor
+        >>> from sklearn.model_selection import GridSearchCV, GroupKFold
+        >>> table = cfx.read(dataset="synthetic", pairs=4, frames=120).frame
+        >>> settings = {"optimizer": "random", "optimizer.samples": 64}
+        >>> regressor = CarFollowingRegressor(settings=settings)
+        >>> search = GridSearchCV(regressor, {"model": ["idm", "krauss"]}, cv=GroupKFold(2))
+        >>> search.fit(table, groups=table["pair_id"]).best_params_["model"] in {"idm", "krauss"}
+        True
+        >>> search.predict(table).shape
+        (480,)
+    """
+
+    def __init__(
+        self,
+        model: str = "idm",
+        objective: str = "speed_rmse",
+        seed: int = 0,
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        self.model = model
+        self.objective = objective
+        self.seed = seed
+        self.settings = settings
+
+    def fit(self, X: pd.DataFrame, y: object = None, groups: ArrayLike | None = None) -> Self:  # noqa: N803 - scikit-learn's name
+        """Calibrates one set of parameters on the whole trajectories.
+
+        Args:
+            X: a table in the tidy layout.
+            y: is not read: speeds are in the table.
+            groups: is not read: pairs are in the table.
+
+        Raises:
+            CfxError: the table is not in the layout, or a parameter is wrong.
+        """
+        self.parameters_ = self._pooled(self._pairs(X))
+        self.feature_names_in_ = np.asarray(X.columns.astype(str), dtype=object)
+        self.n_features_in_ = len(X.columns)
+        return self
+
+    def predict(self, X: pd.DataFrame) -> NDArray[np.float64]:  # noqa: N803 - as above
+        """Simulates each follower from the first row of their pair on, in closed loop.
+
+        Args:
+            X: a table in the tidy layout.
+
+        Returns:
+            The followers' speeds in the order of the rows, m/s.
+        """
+        check_is_fitted(self)
+        pairs = self._pairs(X)
+        drive = simulate(self.model, self.parameters_, pairs, **(self.settings or {}))
+        frames = []
+        for pair in pairs.selected:
+            frames.append(pair.first_frame + np.arange(len(pair)))
+        index = pd.MultiIndex.from_arrays([drive["pair_id"], np.concatenate(frames)])
+        speed = pd.Series(drive["speed"].to_numpy(), index)
+        rows = pd.MultiIndex.from_arrays([X["pair_id"].astype(str), X["frame"].astype(int)])
+        return np.asarray(speed.reindex(rows), dtype=np.float64)
+
+    def score(self, X: pd.DataFrame, y: object = None) -> float:  # noqa: N803 - as above
+        """Returns minus the mean loss over the pairs, in the objective's unit: greater is better.
+
+        Args:
+            X: a table in the tidy layout.
+            y: is not read.
+        """
+        check_is_fitted(self)
+        context, last = self._prepared(self._pairs(X))
+        values = torch.tensor(self.parameters_.to_numpy(dtype=np.float64))
+        unit = context.space.to_unit(values.to(context.batch.leader_length))
+        candidates = unit.expand(len(context.batch), 1, -1)
+        with visit():
+            losses = losses_of(
+                context.calibrator, context.objective, context.batch, last, candidates
+            )
+        return -float(losses.mean())
+
+    def _pairs(self, table: pd.DataFrame) -> Pairs:
+        """Returns the pairs of a table.
+
+        Raises:
+            DataError: it is none, or not in the layout.
+        """
+        if not isinstance(table, pd.DataFrame):
+            raise DataError(
+                f"X is of type {type(table).__name__}; give a pandas data frame in the tidy layout,"
+                " a row per pair and frame"
+            )
+        return read(table, min_frames=_SHORTEST)
+
+    def _prepared(self, pairs: Pairs) -> tuple[ProtocolContext, Tensor]:
+        """Returns what calibrates, and the last frame of each pair."""
+        chosen = {"model": self.model, "objective": self.objective, "seed": self.seed}
+        settings = {"policy": "fixed", "protocol": "within_driver", **(self.settings or {})}
+        with visit():
+            experiment = config(pairs, **settings, **chosen)
+            _, _, context = steps.without_files(experiment.config, pairs.selected)
+        return context, Split.none(context.pairs, context.windows).frame
+
+    def _pooled(self, pairs: Pairs) -> pd.Series:
+        """Returns one set of parameters for all drivers, calibrated on whole trajectories."""
+        context, last = self._prepared(pairs)
+        members = torch.ones((1, len(context.pairs)), dtype=torch.bool)
+        with visit():
+            found = context.calibrator.population(context.pairs, context.batch, last, members)
+        return pd.Series(found[0].tolist(), index=list(context.space.names))
+
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.two_d_array = False
+        tags.target_tags.required = False
+        tags.no_validation = True
+        return tags

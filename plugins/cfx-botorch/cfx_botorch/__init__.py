@@ -1,1 +1,0 @@
-"""Bayesian optimisation by BoTorch as an optimizer of cfx."""

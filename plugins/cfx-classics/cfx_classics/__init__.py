@@ -1,1 +1,0 @@
-"""Classic driving models for cfx: `gipps`, `gipps_delay`, `ovm`, `fvdm` and `newell`."""

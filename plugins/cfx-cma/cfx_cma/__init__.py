@@ -1,1 +1,0 @@
-"""CMA-ES for cfx: `optimizer=cma`."""

@@ -1,0 +1,1 @@
+"""Classic driving models, and variants of IDM."""

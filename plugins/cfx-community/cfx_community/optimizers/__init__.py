@@ -1,0 +1,1 @@
+"""Optimizers of other libraries, each problem with a search of its own."""

@@ -1,0 +1,1 @@
+"""Classical estimators of a driver's parameters, and further networks."""

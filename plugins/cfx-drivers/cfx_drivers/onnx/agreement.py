@@ -1,0 +1,75 @@
+"""How far an exported driver's speeds are from cfx's, in a platoon behind a leader that varies."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import onnxruntime
+import torch
+from numpy.typing import NDArray
+
+from cfx.policies.driver_step import DriverState, DriverStep, Motion
+from cfx_drivers.onnx.graph import SIGNALS, kept_of
+
+VEHICLES, STEPS, LENGTH_M = 5, 300, 5.0
+
+Array = NDArray[np.float64]
+
+
+def largest_difference(step: DriverStep, graph: bytes) -> float:
+    """Returns the largest difference of any speed, m/s.
+
+    In each step both get the same: signals, random numbers and what cfx's drivers remember.
+    Otherwise rounding in single precision, in which networks are, would add up.
+
+    Args:
+        step: cfx's own.
+        graph: the ONNX model.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(graph, options)
+    kept = kept_of(step)
+    generator = torch.Generator().manual_seed(0)
+    state = step.begin(VEHICLES)
+    speed, acceleration = np.full(VEHICLES, 10.0), np.zeros(VEHICLES)
+    position = -25.0 * np.arange(1.0, VEHICLES + 1)
+    ahead, leader = 0.0, 10.0
+    worst = 0.0
+    for number in range(STEPS):
+        was = leader
+        leader = max(0.0, 12.0 + 12.0 * math.sin(0.05 * number))
+        ahead += leader * step.dt
+        values = [
+            speed,
+            acceleration,
+            np.concatenate([[leader], speed[:-1]]),
+            np.concatenate([[(leader - was) / step.dt], acceleration[:-1]]),
+            np.concatenate([[ahead], position[:-1]]) - LENGTH_M - position,
+        ]
+        noise = torch.randn((VEHICLES, step.noise_width), generator=generator, dtype=torch.float64)
+        given = dict(zip(SIGNALS, values, strict=True))
+        for name, value in state._asdict().items():
+            if name in kept:
+                given[name] = value.numpy()
+        if step.noise_width:
+            given["noise"] = noise.numpy()
+        found = session.run(["next_speed"], given)[0]
+        expected, state = _expected(step, state, values, noise)
+        difference = float(np.abs(found - expected).max())
+        worst = float(np.maximum(worst, difference))  # NaN, if there is one
+        acceleration = (expected - speed) / step.dt
+        position = position + expected * step.dt
+        speed = expected
+    return worst
+
+
+def _expected(
+    step: DriverStep, state: DriverState, values: list[Array], noise: torch.Tensor
+) -> tuple[Array, DriverState]:
+    """Returns cfx's next speeds, and what its drivers remember then."""
+    v, a, v_l, a_l, gap = (torch.from_numpy(value) for value in values)
+    drawn = noise if step.noise_width else None
+    speed, state = step(state, Motion(v, a), Motion(v_l, a_l), gap, drawn)
+    return speed.numpy(), state

@@ -1,1 +1,0 @@
-"""Classical estimators of a driver's parameters as policies."""

@@ -1,1 +1,0 @@
-"""The improved acceleration function of the Intelligent Driver Model (`iidm`), for cfx."""

@@ -1,0 +1,88 @@
+"""Pair by pair against another's errors."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pandas as pd
+
+from cfx.core.errors import DataError
+from cfx.evaluation.statistics import Improvement, improvement_statistics
+from cfx_report.benchmark.row import COUNTS
+
+_NEEDED = ("row", "pair_id", "driver")
+
+
+def read_errors(path: Path) -> pd.DataFrame:
+    """Reads errors per pair, of one row or several.
+
+    Raises:
+        DataError: the file cannot be read, or is none of the benchmark's.
+    """
+    try:
+        table = pd.read_csv(path)
+    except (OSError, ValueError, UnicodeDecodeError) as error:
+        raise DataError(f"{path}: cannot be read as CSV ({error})") from None
+    missing = [name for name in (*_NEEDED, "protocol") if name not in table.columns]
+    if missing:
+        raise DataError(
+            f"{path}: column {missing[0]} is missing; --against takes the benchmark_pairs.csv that"
+            " cfx benchmark writes"
+        )
+    return table
+
+
+def compared(
+    mine: pd.DataFrame, others: pd.DataFrame, source: str
+) -> dict[tuple[str, str], Improvement]:
+    """Compares errors with those of every row of a table.
+
+    Returns:
+        By row and metric: how much smaller my errors are, as a share of theirs, with the interval
+        over drivers and Wilcoxon's test.
+
+    Raises:
+        DataError: the other pairs or their protocol are not mine.
+    """
+    found: dict[tuple[str, str], Improvement] = {}
+    protocol = mine["protocol"].iloc[0]
+    metrics = [name for name in mine.columns if name not in (*_NEEDED, "protocol", *COUNTS)]
+    for name, other in others.groupby("row", sort=False):
+        theirs = sorted(set(other["protocol"].astype(str)))
+        if theirs != [protocol]:
+            raise DataError(
+                f"{source}, row '{name}': is of the protocol {', '.join(theirs)}, this is of"
+                f" {protocol}; errors of different protocols or pairs do not compare"
+            )
+        if other["pair_id"].duplicated().any():
+            raise DataError(f"{source}, row '{name}': a pair stands in it twice")
+        both = mine.merge(other, on="pair_id", suffixes=("", "_other"))
+        if len(both) < len(mine) or len(other) != len(mine):
+            raise DataError(
+                f"{source}, row '{name}': has {len(other)} pairs, of which {len(both)} are among my"
+                f" {len(mine)}; the benchmark compares all of them"
+            )
+        for metric in metrics:
+            if f"{metric}_other" not in both:
+                raise DataError(f"{source}, row '{name}': column {metric} is missing")
+            found[str(name), metric] = improvement_statistics(
+                both[f"{metric}_other"].to_numpy(float),
+                both[metric].to_numpy(float),
+                both["driver"].astype(str).tolist(),
+                seed=0,
+            )
+    return found
+
+
+def lines_of(found: dict[tuple[str, str], Improvement]) -> list[str]:
+    """Returns a comparison as a Markdown table."""
+    lines = [
+        "| against | error | smaller by | 95 % interval | pairs won | p |",
+        "| --- | --- | --- | --- | --- | --- |",
+    ]
+    for (row, metric), one in found.items():
+        lines.append(
+            f"| {row} | {metric} | {one.mean:+.1%} | {one.ci95_low:+.1%} to {one.ci95_high:+.1%} |"
+            f" {one.win_rate:.0%} of {one.pairs} | {one.p_value:.2g} |"
+        )
+    return lines

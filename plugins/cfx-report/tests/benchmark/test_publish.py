@@ -1,0 +1,45 @@
+"""Publishing: a finished job becomes a ready-made policy with a card."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from cfx.core.errors import ConfigError
+from cfx.policies.checkpoint import load, save
+from cfx.policies.ready import FOLDER, card_of, names
+from cfx_report.benchmark import publish
+from cfx_report.benchmark.publish import card_text, make
+from cfx_report.benchmark.recipes import RECIPES
+
+
+def test_there_is_a_recipe_for_each_policy() -> None:
+    assert set(names()) == set(RECIPES)
+
+
+def test_a_finished_job_is_published_without_training(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    name = names()[0]
+    job, folder = tmp_path / "work" / name, tmp_path / "ready"
+    published = FOLDER / name
+    agent = load(published / "policy")
+    save(agent, job / "policy")
+    (job / "metrics.json").write_text((published / "metrics.json").read_text())
+    (job / "data.json").write_text(json.dumps({"fingerprint": "abc"}))
+    monkeypatch.setattr(publish, "FOLDER", folder)
+    stress = card_of(name)["stress"]
+    monkeypatch.setattr(publish, "_stress", lambda _: stress)
+    make([name], tmp_path / "not-needed.parquet", tmp_path / "work")
+    card = json.loads((folder / name / "card.json").read_text())
+    expected = card_of(name)
+    for key in ("model", "errors_on_unseen_drivers", "safety", "valid_range", "command"):
+        assert card[key] == expected[key]
+    assert (folder / name / "CARD.md").read_text() == card_text(card)
+
+
+def test_an_unknown_recipe_is_one_sentence(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"there is no such recipe\. Did you mean 'i80-idm'"):
+        make(["i80-idn"], tmp_path / "data.parquet", tmp_path)

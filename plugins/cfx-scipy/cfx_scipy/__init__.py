@@ -1,1 +1,0 @@
-"""SciPy's differential evolution for cfx: `optimizer=differential_evolution`."""

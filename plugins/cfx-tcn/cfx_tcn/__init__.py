@@ -1,1 +1,0 @@
-"""Temporal convolutional networks for cfx: `policy=tcn`."""
