@@ -24,9 +24,6 @@ from cfx.core.guest import visit
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.simulation.windows import Split
 
-_SHORTEST = 2
-"""Frames of the shortest pair that is read: every row of a table counts."""
-
 
 class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc] # no types
     """Pooled calibration of a driving model: fitted on some drivers, it predicts others' speeds.
@@ -140,7 +137,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
                 f"X is of type {type(table).__name__}; give a pandas data frame in the tidy layout,"
                 " a row per pair and frame"
             )
-        return read(table, min_frames=_SHORTEST)
+        return read(table, min_duration=0)  # every row of a table counts
 
     def _prepared(self, pairs: Pairs) -> tuple[ProtocolContext, Tensor]:
         """Returns what calibrates, and the last frame of each pair."""

@@ -199,7 +199,7 @@ def i80_pairs(shared_data: Path) -> PairSet:
     from cfx.data.tidy import TidyDataset
 
     path = shared_data / "i80_reconstructed_pairs.parquet"
-    return TidyDataset(path=path, min_frames=2, accelerations="recorded").load()
+    return TidyDataset(path=path, min_duration=0, accelerations="recorded").load()
 
 
 class Installer:

@@ -58,6 +58,8 @@ def test_the_papers_experiments_train_as_the_paper_does(name: str) -> None:
         own["windows"],
     )
     assert values["data"]["name"] == "tidy", "the command line's data wins over the experiment's"
+    assert values["data"]["min_duration"] == 70, "the paper keeps pairs of 700 frames of 0.1 s"
+    assert composed(f"experiment={name}")["data"]["min_duration"] == 0, "simulated ones are kept"
 
 
 @pytest.mark.slow

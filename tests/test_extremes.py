@@ -19,7 +19,7 @@ from cfx.data.tidy import write_tidy
 LENGTH = 5.0
 JOB = (
     "data=tidy",
-    "data.min_frames=20",
+    "data.min_duration=2",
     "protocol=within_driver",
     "policy=gru",
     "policy.hidden_size=4",

@@ -249,7 +249,7 @@ def selected(**settings: object) -> PairSet:
 def test_other_time_steps_are_said_and_can_be_brought_to_the_usual_one(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
-    fine = {"data.dt": 0.04, "data.frames": 500, "data.min_frames": 200}
+    fine = {"data.dt": 0.04, "data.frames": 500, "data.min_duration": 20}
     with caplog.at_level("INFO"):
         selected(**fine)
         assert any(
@@ -266,10 +266,10 @@ def test_a_coarse_time_step_is_warned_of_with_the_remedy(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     coarse = {"data.dt": 0.5, "data.frames": 120}
-    selected(**coarse, **{"data.min_frames": 50})
+    selected(**coarse, **{"data.min_duration": 25})
     assert any("parameters calibrated in such steps are biased" in one for one in caplog.messages)
     caplog.clear()
-    selected(**coarse, **{"data.time_step": 0.1, "data.min_frames": 200})
+    selected(**coarse, **{"data.time_step": 0.1, "data.min_duration": 20})
     assert not any("biased" in message for message in caplog.messages)
 
 
@@ -278,7 +278,7 @@ def test_a_style_cluster_is_selected() -> None:
 
 
 def test_the_raw_sample_is_found(shared_data: Path) -> None:
-    pairs = cfx.read(shared_data / "i80_0400_raw_sample.csv.gz", min_frames=300)
+    pairs = cfx.read(shared_data / "i80_0400_raw_sample.csv.gz", min_duration=30)
     assert (pairs.node["name"], len(pairs)) == ("ngsim", 142)
 
 
@@ -347,7 +347,7 @@ def unread(dataset: str, path: Path, **settings: object) -> str:
 def test_a_broken_table_is_told(name: str, tidy: Path) -> None:
     change, expected = BROKEN_TABLES[name]
     change(pd.read_csv(tidy)).to_csv(tidy, index=False)
-    message = unread("tidy", tidy, min_frames=50)
+    message = unread("tidy", tidy, min_duration=5)
     assert expected in message
     assert "pairs.csv" in message
 
@@ -394,8 +394,8 @@ def test_a_wrong_separator_is_told(tidy: Path, capsys: pytest.CaptureFixture[str
         (["policy.inputs=[leader_sped]"], "leader_speed"),
         (["learner.epochs=fast"], "learner.epochs"),
         (["data.max_pairs=50"], "50"),
-        (["data.pairs=6", "data.frames=9"], "min_frames"),
-        (["data.min_frames=5000"], "5000"),
+        (["data.pairs=6", "data.frames=9"], "min_duration"),
+        (["data.min_duration=500"], "500 s"),
         (["style.cluster=agressive"], "aggressive"),
         (["device=cuda:99"], "device"),
     ],

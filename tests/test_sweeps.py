@@ -226,7 +226,7 @@ def test_its_fingerprint_is_of_all_that_its_results_depend_on(
     monkeypatch.chdir(tmp_path)
     for name in ("a.csv", "b.csv"):
         Path(name).write_text("a")
-    job = ["data=tidy", "data.path=*.csv", "data.min_frames=${oc.env:CFX_FRAMES}"]
+    job = ["data=tidy", "data.path=*.csv", "data.min_duration=${oc.env:CFX_FRAMES}"]
     found = []
     for frames in ("100", "200"):
         monkeypatch.setenv("CFX_FRAMES", frames)

@@ -176,7 +176,7 @@ def _origins(context: ProtocolContext, at: float) -> Origins:
         if not 1 <= frame < len(pair) - 1:
             raise ConfigError(
                 f"at={at:g}: pair '{pair.pair_id}' lasts {(len(pair) - 1) * pair.dt:g} s; give a"
-                " moment within every pair, or read longer ones (min_frames)"
+                " moment within every pair, or read longer ones (min_duration)"
             )
     everyone = torch.arange(len(batch), device=batch.lengths.device)
     return Origins(everyone, torch.full_like(everyone, frame))

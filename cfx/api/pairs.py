@@ -79,7 +79,7 @@ class Pairs:
                     "pair_id": pair.pair_id,
                     "driver": pair.driver,
                     "frames": len(pair),
-                    "duration_s": (len(pair) - 1) * pair.dt,
+                    "duration_s": pair.duration,
                     "mean_speed": float(np.mean(pair.follower_speed)),
                     "mean_gap": float(np.mean(pair.gap)),
                 }
@@ -120,7 +120,7 @@ class Pairs:
             OutputError: the file cannot be written.
         """
         write_tidy(self.selected, path)
-        settings = {"data": "tidy", "data.path": absolute(path), "data.min_frames": 2}
+        settings = {"data": "tidy", "data.path": absolute(path), "data.min_duration": 0}
         return Pairs.of(config_of({**settings, "data.accelerations": "recorded"}).data)
 
     def plot(self, pair_ids: Sequence[str] | None = None) -> Figure:
@@ -170,7 +170,7 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
             tidy layout (pandas, xarray, or whatever has an Arrow interface, such as polars). None
             for a dataset that reads no file.
         dataset: the dataset that reads it, as after `data=`; None: found from the file itself.
-        settings: of the dataset: `min_frames=300`, `time_step=0.1`, `max_pairs=20` and so on; a
+        settings: of the dataset: `min_duration=30`, `time_step=0.1`, `max_pairs=20` and so on; a
             table's own names and units: `columns={"speed": "v"}`, `units={"speed": "km/h"}`.
 
     Raises:
@@ -182,7 +182,7 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
         >>> pairs = cfx.read(dataset="synthetic", pairs=3, frames=200)
         >>> len(pairs), pairs.frame.shape[0]
         (3, 600)
-        >>> cfx.read(pairs.frame, min_frames=2)
+        >>> cfx.read(pairs.frame, min_duration=0)
         Pairs(3 pairs of 3 drivers, 60 s in steps of 0.1 s, from the table)
     """
     if isinstance(source, Pairs):

@@ -135,6 +135,15 @@ def register() -> None:
     plugins.register(ComponentSource)
     plugins.register(ComponentSearchPath)
     OmegaConf.register_new_resolver("cfx_commands", listed_commands, replace=True)
+    OmegaConf.register_new_resolver("cfx_recorded", of_recordings, replace=True)
+
+
+def of_recordings(duration: float, *, _root_: DictConfig) -> float:
+    """Returns `data.min_duration` of a preset, s: 0 where the job simulates its pairs itself.
+
+    How long simulated pairs are the job says itself.
+    """
+    return duration if "path" in _root_.data else 0.0
 
 
 def listed_commands() -> str:

@@ -17,7 +17,7 @@ from cfx.results.config import JobConfig
 
 
 def override(key: str, value: Any) -> str:
-    """Returns the override that gives a setting, such as `data.min_frames`, a plain value."""
+    """Returns the override that gives a setting, such as `data.min_duration`, a plain value."""
     return f"{key}={_text(value)}"
 
 

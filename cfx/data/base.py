@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -61,8 +62,11 @@ class DatasetSettings(Settings):
         " as with a wrong unit or time step: refuse: the job ends; report: a warning; off: not"
         " checked",
     )
-    min_frames: int = Field(
-        700, ge=2, description="shortest pair that is kept, frames; the paper keeps 700"
+    min_duration: float = Field(
+        10.0,
+        ge=0,
+        description="s: shortest pair that is kept, of as many frames as this holds time steps; 0:"
+        " all; the paper keeps pairs of 70 s",
     )
     time_step: float | None = Field(
         None,
@@ -229,8 +233,8 @@ class Dataset(Component):
     def load(self) -> PairSet:
         """Returns the pairs that the settings select.
 
-        They are selected by recording, lane, id, what drives them, and length; of those the first
-        `max_pairs` are kept. Lengths count in steps of `time_step`.
+        They are selected by recording, lane, id, what drives them, and duration, after they were
+        brought to `time_step`; of those the first `max_pairs` are kept. Short ones are warned of.
 
         Raises:
             DataError: as `read`; or the recording, a pair id or a type of driver is unknown, the
@@ -256,7 +260,7 @@ class Dataset(Component):
                     f"data.time_step={self.settings.time_step:g}: no pair in {pairs.source} lasts"
                     " two such steps; give a shorter one"
                 )
-        selected = _select_first(_select_long(pairs, self.settings.min_frames), self.settings)
+        selected = _select_first(_select_long(pairs, self.settings.min_duration), self.settings)
         used = tuple(recorded[pair.pair_id] for pair in selected.pairs)
         check_kinematics(
             replace(selected, pairs=used),
@@ -395,16 +399,34 @@ def _selected(pairs: PairSet, name: str, wanted: Any) -> PairSet:
     return pairs.select([value in asked for value in values], others)
 
 
-def _select_long(pairs: PairSet, min_frames: int) -> PairSet:
-    kept = [len(pair) >= min_frames for pair in pairs]
-    long = pairs.select(kept, f"shorter than {min_frames} frames")
+def _select_long(pairs: PairSet, min_duration: float) -> PairSet:
+    """Keeps the pairs that last at least so many seconds, and warns of the others."""
+    kept = [pair.lasts(min_duration) for pair in pairs]
+    long = pairs.select(kept, f"shorter than {min_duration:g} s")
     if not len(long):
-        longest = max(len(pair) for pair in pairs)
+        longest = max(pair.duration for pair in pairs)
         raise DataError(
-            f"{pairs.source}: none of its {len(pairs)} pairs has at least {min_frames} frames, the"
-            f" longest has {longest}; lower data.min_frames"
+            f"{pairs.source}: none of its {len(pairs)} pairs lasts {min_duration:g} s, the longest"
+            f" lasts {longest:.6g} s; lower data.min_duration"
+        )
+    short = len(pairs) - len(long)
+    if short:
+        shortest = min(pair.duration for pair in pairs)
+        log.warning(
+            "%s: %d of %d pairs are left out, which last less than data.min_duration=%g s;"
+            " data.min_duration=%g keeps all",
+            pairs.source,
+            short,
+            len(pairs),
+            min_duration,
+            rounded_down(shortest),
         )
     return long
+
+
+def rounded_down(duration: float) -> float:
+    """Returns a duration, s, to write into a setting: in tenths, and no longer than this one."""
+    return math.floor(10.0 * duration + 1e-6) / 10.0
 
 
 def _select_first(pairs: PairSet, settings: DatasetSettings) -> PairSet:
@@ -416,8 +438,8 @@ def _select_first(pairs: PairSet, settings: DatasetSettings) -> PairSet:
         if settings.recording or settings.lanes:
             where = " in the selected recording and lanes"
         raise DataError(
-            f"{pairs.source}: asked for {wanted} pairs but only {len(pairs)} have at least"
-            f" {settings.min_frames} frames{where}; lower data.max_pairs or data.min_frames"
+            f"{pairs.source}: asked for {wanted} pairs but only {len(pairs)} last"
+            f" {settings.min_duration:g} s{where}; lower data.max_pairs or data.min_duration"
         )
     beyond = Dropped(f"beyond max_pairs ({wanted})", len(pairs) - wanted)
     return replace(pairs, pairs=pairs.pairs[:wanted], dropped=(*pairs.dropped, beyond))

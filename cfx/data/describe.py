@@ -19,7 +19,7 @@ from cfx.core.distributions import OWN
 from cfx.core.errors import DataError, PluginError, listed
 from cfx.core.files import path_override
 from cfx.core.registry import Entry
-from cfx.data.base import Contents, Dataset
+from cfx.data.base import Contents, Dataset, rounded_down
 from cfx.data.files import Floats, beginning, partitions
 from cfx.data.kinematics import in_words
 from cfx.data.pairs import Dropped, Pair, PairSet
@@ -40,8 +40,8 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-_THRESHOLDS = (300, 500, 700)
-"""Lengths in frames for which pairs are counted."""
+_THRESHOLDS_S = (10, 30, 70)
+"""Durations for which pairs are counted, s."""
 
 _QUANTILES = {
     0.0: "least",
@@ -61,8 +61,11 @@ _WIDTH = 110
 _WIDE = 150
 """Characters in a line, and in one of the table of styles."""
 
-_ROUND = 50
-"""Frames; a least length that is advised is a multiple of it, if pairs are that long."""
+_ROUND_S = 5.0
+"""A least duration that is advised is a multiple of it, s, if pairs last that long."""
+
+_ROUNDING_S = 1e-6
+"""Differences of durations that are rounding, s."""
 
 
 class Description(NamedTuple):
@@ -114,7 +117,7 @@ def describe(
         problems.append(contents.problem)
     pieces += ["", f"Problems:{'' if problems else ' none found'}"]
     pieces += [f"  {sentence}" for sentence in problems]
-    more, kept = _advice(_lengths(contents.pairs), dataset.settings.min_frames)
+    more, kept = _advice(_lengths(contents.pairs), dataset.settings.min_duration)
     pieces += ["", reader.use(path) + more, *kept]
     return Description(_text(pieces), contents.pairs)
 
@@ -233,7 +236,8 @@ class _Reader(NamedTuple):
 
 def _describe_partitions(folder: Path, reader: _Reader) -> str:
     """Says what each file of a folder holds; reads one file after the other."""
-    headings = ("recordings", "rows", "pairs", "drivers", "frames", "of at least 700 frames")
+    long_s = _THRESHOLDS_S[-1]
+    headings = ("recordings", "rows", "pairs", "drivers", "frames", f"of at least {long_s} s")
     table = _table("file", *headings)
     totals = [0] * 5
     names: set[str] = set()
@@ -245,7 +249,7 @@ def _describe_partitions(folder: Path, reader: _Reader) -> str:
         pairs = contents.pairs
         recordings = {pair.recording for pair in pairs}
         drivers = {pair.driver for pair in pairs}
-        long = sum(len(pair) >= _THRESHOLDS[-1] for pair in pairs)
+        long = sum(pair.lasts(long_s) for pair in pairs)
         counts = [contents.rows, len(pairs), len(drivers), _frames(pairs), long]
         totals = [before + count for before, count in zip(totals, counts, strict=True)]
         names |= recordings
@@ -253,7 +257,7 @@ def _describe_partitions(folder: Path, reader: _Reader) -> str:
         cells = [f"{count:,}" for count in counts]
         table.add_row(str(file.relative_to(folder)), listed(sorted(recordings), 2), *cells)
     table.add_row("all", f"{len(names):,}", *[f"{count:,}" for count in totals])
-    more, kept = _advice(lengths, dataset.settings.min_frames)
+    more, kept = _advice(lengths, dataset.settings.min_duration)
     layout = f"{dataset.layout}, {len(files)} files, read one after the other"
     alone = "A recording alone: python -m cfx data describe FILE"
     one = "One recording of it: data.recording=NAME"
@@ -318,12 +322,12 @@ def _lengths(pairs: PairSet) -> list[tuple[int, float]]:
     return [(len(pair), round(pair.dt, 9)) for pair in pairs]
 
 
-def _advice(pairs: Sequence[tuple[int, float]], usual: int) -> tuple[str, list[str]]:
+def _advice(pairs: Sequence[tuple[int, float]], usual: float) -> tuple[str, list[str]]:
     """Returns the options that a job needs to use at least half of the pairs, and what it keeps.
 
     Args:
         pairs: frames and time steps, of all files.
-        usual: shortest pair, in frames, that a job keeps unless told otherwise.
+        usual: how long a pair lasts at least, s, that a job keeps unless told otherwise.
     """
     if not pairs:
         return "", []
@@ -332,18 +336,20 @@ def _advice(pairs: Sequence[tuple[int, float]], usual: int) -> tuple[str, list[s
     step = max(steps)
     if len(steps) > 1:
         options = f" data.time_step={step:g}"
-    lengths = sorted(frames_in_steps(frames, dt, step) for frames, dt in pairs)
-    median = lengths[(len(lengths) - 1) // 2]
+    durations = sorted(frames_in_steps(frames, dt, step) * step for frames, dt in pairs)
+    median = durations[(len(durations) - 1) // 2]
     least = usual
-    if sum(length >= usual for length in lengths) * 2 < len(lengths):
-        least = max(median // _ROUND * _ROUND, min(median, _ROUND))
-        options += f" data.min_frames={least}"
-    kept = sum(length >= least for length in lengths)
-    if kept == len(lengths):
+    if sum(duration >= usual - _ROUNDING_S for duration in durations) * 2 < len(durations):
+        least = rounded_down(median)
+        if least > _ROUND_S:
+            least = least // _ROUND_S * _ROUND_S
+        options += f" data.min_duration={least:g}"
+    kept = sum(duration >= least - _ROUNDING_S for duration in durations)
+    if kept == len(durations):
         return options, [f"It keeps all {kept:,} pairs."]
     return options, [
-        f"It keeps {kept:,} of {len(lengths):,} pairs and leaves out {len(lengths) - kept:,}"
-        f" shorter than {least} frames; data.min_frames={lengths[0]} keeps all."
+        f"It keeps {kept:,} of {len(durations):,} pairs and leaves out {len(durations) - kept:,}"
+        f" shorter than {least:g} s; data.min_duration={rounded_down(durations[0]):g} keeps all."
     ]
 
 
@@ -366,9 +372,9 @@ def _overview(layout: str, contents: Contents) -> Table:
     table.add_row("lanes", listed(lanes) or "not known")
     table.add_row("pairs", f"{len(pairs):,} of {len(drivers):,} drivers, {_frames(pairs):,} frames")
     table.add_row("time step", listed([f"{step:g} s" for step in steps]) or "-")
-    for frames in _THRESHOLDS:
-        count = sum(len(pair) >= frames for pair in pairs)
-        table.add_row(f"  of at least {frames} frames", f"{count:,}")
+    for duration in _THRESHOLDS_S:
+        count = sum(pair.lasts(duration) for pair in pairs)
+        table.add_row(f"  of at least {duration} s", f"{count:,}")
     for name, title in _TYPES.items():
         types = Counter(getattr(pair, name) or "not known" for pair in pairs)
         if set(types) - {"not known"}:

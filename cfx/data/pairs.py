@@ -104,6 +104,16 @@ class Pair:
         return len(self.leader_position)
 
     @property
+    def duration(self) -> float:
+        """How long the pair lasts, s; each frame counts with one time step."""
+        return len(self) * self.dt
+
+    def lasts(self, duration: float) -> bool:
+        """Says whether the pair lasts so many seconds at least; one frame alone lasts no time."""
+        # A share of a frame less than a millionth is rounding: 70 s are 700 frames of 0.1 s.
+        return len(self) >= max(2.0, duration / self.dt - 1e-6)
+
+    @property
     def driver(self) -> str:
         """Who drives the follower, unique across recordings.
 

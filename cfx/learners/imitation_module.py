@@ -127,7 +127,7 @@ def _training_windows(mask: Tensor, validation: float) -> Tensor:
     if bool((counts - kept < 1).any()):
         raise DataError(
             f"a pair has only {int(counts.min())} training windows, too few to keep {validation:g}"
-            " of them for validation; raise data.min_frames or set learner.validation=0"
+            " of them for validation; raise data.min_duration or set learner.validation=0"
         )
     number = torch.arange(mask.shape[1], device=mask.device)
     return mask & (number < (counts - kept)[:, None])

@@ -53,7 +53,7 @@ _BYTES = 200.0  # of a pair and frame: signals, and the true parameters over tim
 class SyntheticSettings(DatasetSettings):
     """Settings of synthetic pairs."""
 
-    min_frames: int = Field(2, ge=2, description="shortest pair that is kept, frames")
+    min_duration: float = Field(0.0, ge=0, description="s: shortest pair that is kept; 0: all")
     seed: int = Field(0, ge=0, description="same seed, same data")
     pairs: int = Field(8, ge=1, description="number of leader-follower pairs")
     frames: int = Field(600, ge=2, description="frames of each pair")

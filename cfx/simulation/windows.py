@@ -52,10 +52,11 @@ class Split:
             count = settings.count(len(pair))
             first = _training_windows(share, count)
             if first < 2 or first >= count:
+                least = _least_frames(settings, share) * pair.dt
                 raise DataError(
                     f"pair {pair.pair_id} has {len(pair)} frames, too few for windows of"
                     f" {settings.length} steps with split={share:g};"
-                    f" set data.min_frames to at least {_least_frames(settings, share)}"
+                    f" set data.min_duration to at least {least:.6g}"
                 )
             last = first * settings.stride
             frames.append(last)
@@ -97,7 +98,7 @@ class Split:
             f"split={share:g} leaves {sum(tested):,} frames of {len(tested)} pairs to be tested,"
             f" {lasts:.2g} s of the median pair"
         )
-        remedy = "lower split, or keep longer pairs (data.min_frames)"
+        remedy = "lower split, or keep longer pairs (data.min_duration)"
         if middle <= settings.length:
             raise DataError(f"{said}, no more than one window, in which nothing adapts; {remedy}")
         log.warning(

@@ -65,7 +65,7 @@ print(pd.read_csv("recording.csv").iloc[:2].T)
 common = [
     "data=tidy",
     "data.path=recording.csv",
-    "data.min_frames=100",
+    "data.min_duration=10",
     "policy=fixed",
     "tracking.enabled=false",
 ]

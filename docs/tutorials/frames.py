@@ -31,10 +31,10 @@ print(table[["pair_id", "time_s", "leader_speed_mps", "v"]].head(3).round(2))
 
 # %%
 own = {"columns": {"speed": "v"}, "units": {"speed": "km/h"}}
-pairs = cfx.read(table, min_frames=100, **own)
+pairs = cfx.read(table, min_duration=10, **own)
 print(pairs)
 try:
-    cfx.read(table, min_frames=100, columns=own["columns"])
+    cfx.read(table, min_duration=10, columns=own["columns"])
 except cfx.errors.CfxError as error:
     print(error)
 

@@ -135,12 +135,12 @@ def test_nothing_is_written(
 
 def test_data_frames_of_other_libraries_are_read(pairs: cfx.Pairs) -> None:
     table = pa.Table.from_pandas(pairs.frame)
-    read = cfx.read(table, min_frames=2, accelerations="recorded")
+    read = cfx.read(table, min_duration=0, accelerations="recorded")
     assert [one.content for one in read.selected] == [one.content for one in pairs.selected]
 
 
 def test_a_recording_says_its_layout_itself(pairs: cfx.Pairs) -> None:
-    read = cfx.read(pairs.node["path"], min_frames=2, max_pairs=2)
+    read = cfx.read(pairs.node["path"], min_duration=0, max_pairs=2)
     assert read.node["name"] == "tidy"
     assert read.dropped["count"].tolist() == [1]
 
@@ -149,11 +149,11 @@ def test_columns_and_units_of_ones_own_are_mapped(pairs: cfx.Pairs) -> None:
     frame = pairs.frame.rename(columns={"follower_speed_mps": "v"})
     frame["v"] *= 3.6
     own = {"columns": {"speed": "v"}, "units": {"speed": "km/h"}}
-    read = cfx.read(frame, min_frames=2, accelerations="recorded", **own)
+    read = cfx.read(frame, min_duration=0, accelerations="recorded", **own)
     for one, other in zip(read.selected, pairs.selected, strict=True):
         np.testing.assert_allclose(one.follower_speed, other.follower_speed, rtol=1e-12)
     with pytest.raises(ConfigError, match="cannot be turned into m/s"):
-        cfx.read(frame, min_frames=2, columns={"speed": "v"}, units={"speed": "km"})
+        cfx.read(frame, min_duration=0, columns={"speed": "v"}, units={"speed": "km"})
 
 
 def test_pairs_are_counted_selected_and_shown(pairs: cfx.Pairs) -> None:
@@ -168,7 +168,7 @@ def test_pairs_are_counted_selected_and_shown(pairs: cfx.Pairs) -> None:
 
 
 def test_pairs_of_a_data_frame_have_no_command(pairs: cfx.Pairs) -> None:
-    fit = cfx.calibrate(cfx.read(pairs.frame, min_frames=2), "idm", optimizer="random")
+    fit = cfx.calibrate(cfx.read(pairs.frame, min_duration=0), "idm", optimizer="random")
     with pytest.raises(DataError, match="save them first"):
         _ = fit.command
 
@@ -283,13 +283,13 @@ def test_a_grid_of_pairs_and_frames_has_no_rows_beyond_a_pairs_end(pairs: cfx.Pa
         def to_dataframe(self) -> pd.DataFrame:
             return grid
 
-    settings = {"min_frames": 2, "accelerations": "recorded"}
+    settings = {"min_duration": 0, "accelerations": "recorded"}
     expected = cfx.read(frame, **settings).selected.fingerprint
     assert cfx.read(Dataset(), **settings).selected.fingerprint == expected
 
 
 def test_pairs_say_what_reading_has_left_out(pairs: cfx.Pairs) -> None:
-    read = cfx.read(pairs.frame, min_frames=2, max_pairs=1)
+    read = cfx.read(pairs.frame, min_duration=0, max_pairs=1)
     assert repr(read).endswith("from the table; left out: 2 beyond max_pairs (1))")
 
 

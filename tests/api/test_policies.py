@@ -108,7 +108,7 @@ def test_a_forecast_reads_nothing_after_its_moment(others: cfx.Pairs) -> None:
     frame = others.frame
     after = frame["time_s"] > 10.0
     changed = frame.assign(follower_speed_mps=np.where(after, 3.0, frame["follower_speed_mps"]))
-    settings = {"min_frames": 2, "accelerations": "recorded", "check": "off"}
+    settings = {"min_duration": 0, "accelerations": "recorded", "check": "off"}
     found = []
     for table in (frame, changed):
         read = cfx.read(table, **settings)

@@ -39,7 +39,7 @@ def memory() -> float:
 
 def drivers(copies: int) -> PairSet:
     """Returns I-80's pairs, each as often as that."""
-    pairs = TidyDataset(path=str(_FILE), min_frames=300).load()
+    pairs = TidyDataset(path=str(_FILE), min_duration=30).load()
     several = []
     for copy in range(copies):
         for pair in pairs:

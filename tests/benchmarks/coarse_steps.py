@@ -77,7 +77,7 @@ def driven(model: DrivingModel) -> tuple[PairSet, Tensor]:
         noise_speed_mps=0,
         noise_position_m=0,
         seed=1,
-        min_frames=2,
+        min_duration=0,
     ).load()
     batch = PairBatch.of(made)
     draw = torch.Generator().manual_seed(0)

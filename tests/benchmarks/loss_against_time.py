@@ -56,7 +56,7 @@ _STEEPEST = 6.0
 
 def problems(model: DrivingModel, pairs: int) -> Iterator[tuple[str, SegmentLosses]]:
     """Yields the losses of full training parts and of their windows."""
-    dataset = TidyDataset(path=str(_FILE), recording="i80-0400", max_pairs=pairs)
+    dataset = TidyDataset(path=str(_FILE), recording="i80-0400", min_duration=70, max_pairs=pairs)
     pair_set = dataset.load()
     batch, windows = PairBatch.of(pair_set), WindowSettings()
     split = Split.of(pair_set, windows, _SPLIT)

@@ -138,8 +138,8 @@ def recording(name: str) -> Iterator[str]:
     """Yields what the first seconds of I-80's pairs of 70 s say, and the time for all pairs."""
     settings = CalibrationSettings(posterior="laplace")
     model = MODELS[name]
-    for least, seconds in ((700, 15), (700, 30), (700, 60), (700, None), (0, None)):
-        pairs = TidyDataset(path=I80, min_frames=max(least, 2)).load()
+    for least, seconds in ((70, 15), (70, 30), (70, 60), (70, None), (0, None)):
+        pairs = TidyDataset(path=I80, min_duration=least).load()
         batch = PairBatch.of(pairs, dtype=torch.float64)
         last = batch.lengths - 1
         if seconds is not None:
@@ -168,7 +168,7 @@ def chains(name: str) -> Iterator[str]:
     The chains are emcee's (affine-invariant ensembles, Goodman and Weare 2010), a driver at a time.
     """
     model = MODELS[name]
-    pairs = TidyDataset(path=I80, min_frames=700, max_pairs=10).load()
+    pairs = TidyDataset(path=I80, min_duration=70, max_pairs=10).load()
     batch = PairBatch.of(pairs, dtype=torch.float64)
     solver = Solver(MemoryStepper(model, batch.dt), RandomSearch(), seed=0)
     settings = CalibrationSettings(posterior="laplace")
@@ -244,7 +244,7 @@ def apart(found: Chains, quantiles: Tensor, n: int) -> Tensor:
 
 def recorded(name: str, drivers: int) -> Posterior:
     """Returns the posterior of the first I-80 drivers of 70 s or more."""
-    pairs = TidyDataset(path=I80, min_frames=700, max_pairs=drivers).load()
+    pairs = TidyDataset(path=I80, min_duration=70, max_pairs=drivers).load()
     batch = PairBatch.of(pairs, dtype=torch.float64)
     solver = Solver(MemoryStepper(MODELS[name], batch.dt), RandomSearch(), seed=0)
     settings = CalibrationSettings(posterior="nuts")
@@ -370,7 +370,7 @@ def beside(name: str) -> Iterator[str]:
 def sumo(name: str) -> Iterator[str]:
     """Yields the posteriors of I-80 drivers with SUMO in the loop, beside those of equations."""
     model = cast("DrivingModel", create("model", {"name": name}))
-    pairs = TidyDataset(path=I80, min_frames=700, max_pairs=IN_SUMO).load()
+    pairs = TidyDataset(path=I80, min_duration=70, max_pairs=IN_SUMO).load()
     batch = PairBatch.of(pairs, dtype=torch.float64)
     settings = CalibrationSettings(posterior="sbi")
     simulator = cast("Simulator", create("simulator", {"name": "sumo", "workers": 1}))
@@ -492,7 +492,7 @@ def forecasts(name: str) -> Iterator[str]:
     A path drives on from the recording's start, and its noise from the last error.
     """
     model = MODELS[name]
-    pairs = TidyDataset(path=I80, min_frames=700).load()
+    pairs = TidyDataset(path=I80, min_duration=70).load()
     batch = PairBatch.of(pairs, dtype=torch.float64)
     solver = Solver(MemoryStepper(model, batch.dt), RandomSearch(), seed=0)
     settings = CalibrationSettings(posterior="laplace")

@@ -395,7 +395,7 @@ def read(layout: Layout, pairs: Sequence[Pair], case: Spoiled | None, folder: Pa
     settings = dict(layout.write(folder, signals, lengths))
     cls = registry.get("dataset", layout.dataset) if layout.dataset else PluginsDataset
     try:
-        cls(min_frames=100, **settings).load()  # type: ignore[attr-defined]  # a dataset
+        cls(min_duration=10, **settings).load()  # type: ignore[attr-defined]  # a dataset
     except CfxError as error:
         return str(error)
     return None
@@ -404,7 +404,9 @@ def read(layout: Layout, pairs: Sequence[Pair], case: Spoiled | None, folder: Pa
 def chosen(data: Path, recording: str) -> list[Pair]:
     """Returns some pairs of a recording, over the whole file."""
     name, frames = RECORDINGS[recording]
-    pairs = TidyDataset(path=data / name, min_frames=frames, accelerations="recorded").load()
+    pairs = TidyDataset(
+        path=data / name, min_duration=0.1 * frames, accelerations="recorded"
+    ).load()
     cut = []
     for pair in pairs.pairs[:: max(1, len(pairs) // PAIRS)][:PAIRS]:
         cut.append(replace(pair, **{one: getattr(pair, one)[:frames] for one in SIGNALS}))

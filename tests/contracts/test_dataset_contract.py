@@ -65,7 +65,7 @@ class Silent(Straight):
     def load(self) -> PairSet:
         from cfx.core.errors import DataError
 
-        if self.settings.min_frames > 900:
+        if self.settings.min_duration > 90:
             raise DataError("no pairs")
         return super().load()
 
@@ -109,7 +109,7 @@ BROKEN: dict[str, tuple[Dataset, Any, str]] = {
         "must be counted",
     ),
     "too much": (Everything(), checks.asking_for_too_much_is_an_error, "must raise DataError"),
-    "silent": (Silent(), checks.asking_for_too_much_is_an_error, "must name min_frames"),
+    "silent": (Silent(), checks.asking_for_too_much_is_an_error, "must name min_duration"),
 }  # fmt: skip
 
 

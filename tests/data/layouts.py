@@ -13,7 +13,7 @@ from cfx.simulation.synthetic import SyntheticDataset
 
 def made_pairs(pairs: int = 3, frames: int = 150) -> PairSet:
     """Pairs whose speeds and positions belong together."""
-    return SyntheticDataset(pairs=pairs, frames=frames, min_frames=2).load()
+    return SyntheticDataset(pairs=pairs, frames=frames, min_duration=0).load()
 
 
 def tracks_of(rows: list[tuple[int, int, int, int, float]], **more: object) -> Tracks:

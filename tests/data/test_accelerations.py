@@ -72,18 +72,20 @@ def test_what_was_smoothed_is_said_and_can_be_refused(
     path = tmp_path / "noisy.parquet"
     write_tidy(PairSet((pair,), "test"), path)
     with caplog.at_level(logging.INFO):
-        smooth = TidyDataset(path=path, check="off", min_frames=2).load()[0]
+        smooth = TidyDataset(path=path, check="off", min_duration=0).load()[0]
     assert "Accelerations of 1 of 1 pairs are noisy" in caplog.text
     assert np.std(smooth.follower_acceleration) < 0.5 * np.std(pair.follower_acceleration)
     assert smooth.leader_acceleration is not smooth.follower_acceleration
-    recorded = TidyDataset(path=path, check="off", min_frames=2, accelerations="recorded").load()[0]
+    recorded = TidyDataset(path=path, check="off", min_duration=0, accelerations="recorded").load()[
+        0
+    ]
     assert np.array_equal(recorded.follower_acceleration, pair.follower_acceleration)
 
 
 def test_real_recordings_are_told_apart(shared_data: Path, i80_pairs: PairSet) -> None:
     assert with_usable_accelerations(i80_pairs, "smooth") is i80_pairs
     ispra = TidyDataset(
-        path=shared_data / "openacc_ispra_low_speed_pairs.parquet", min_frames=2
+        path=shared_data / "openacc_ispra_low_speed_pairs.parquet", min_duration=0
     ).read()
     for pair in ispra:
         average = best_average(pair.follower_speed, pair.follower_acceleration, pair.dt)

@@ -107,7 +107,7 @@ def test_a_spoiled_file_is_refused_and_its_reason_named(name: str, tmp_path: Pat
     path = tmp_path / "pairs.csv"
     change(frame.copy()).to_csv(path, index=False)
     with pytest.raises(DataError, match=reason):
-        TidyDataset(path=path, min_frames=100).load()
+        TidyDataset(path=path, min_duration=10).load()
 
 
 @pytest.mark.parametrize("frame", [FULL, BY_GAP], ids=["full", "by gap"])
@@ -116,7 +116,7 @@ def test_files_as_they_should_be_are_read_without_a_word(
 ) -> None:
     path = tmp_path / "pairs.csv"
     frame.to_csv(path, index=False)
-    assert len(TidyDataset(path=path, min_frames=100).load()) == len(PAIRS)
+    assert len(TidyDataset(path=path, min_duration=10).load()) == len(PAIRS)
     assert not caplog.records
 
 
@@ -137,7 +137,7 @@ def test_what_is_possible_but_rare_is_asked_about_by_a_job_too(
 ) -> None:
     path = tmp_path / "pairs.csv"
     change(frame.copy()).to_csv(path, index=False)
-    TidyDataset(path=path, min_frames=100).load()
+    TidyDataset(path=path, min_duration=10).load()
     assert doubt in caplog.text
     assert doubt in describe(path).text
 

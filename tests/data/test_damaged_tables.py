@@ -53,7 +53,7 @@ def test_what_is_no_name_and_no_lane_is_refused(
 ) -> None:
     path = table(tmp_path, column, values)
     with pytest.raises(DataError, match=message):
-        TidyDataset(path=path, min_frames=2).load()
+        TidyDataset(path=path, min_duration=0).load()
     assert cli.main(["data", "describe", str(path)]) == 2
     said = capsys.readouterr().err
     assert "Traceback" not in said
@@ -72,7 +72,7 @@ def test_a_step_longer_than_every_pair_is_one_sentence(tmp_path: Path) -> None:
     path = tmp_path / "pairs.parquet"
     write_tidy(straight_pairs([ROWS]), path)
     with pytest.raises(DataError, match=r"data\.time_step=10: no pair in .* lasts two such steps"):
-        TidyDataset(path=path, min_frames=2, time_step=10.0).load()
+        TidyDataset(path=path, min_duration=0, time_step=10.0).load()
 
 
 def test_a_terminal_of_few_letters_prints_every_name(

@@ -21,14 +21,14 @@ def test_noisy_synthetic_recordings_of_another_model() -> None:
 @pytest.mark.parametrize("name", ["pairs.parquet", "pairs.csv", "pairs.csv.gz"])
 def test_tidy_tables(name: str, tmp_path: Path) -> None:
     write_tidy(SyntheticDataset(pairs=3, frames=150).load(), tmp_path / name)
-    check_contract(TidyDataset(path=tmp_path / name, min_frames=100))
+    check_contract(TidyDataset(path=tmp_path / name, min_duration=10))
 
 
 def test_real_pairs(shared_data: Path) -> None:
     path = shared_data / "i80_reconstructed_pairs.parquet"
-    check_contract(TidyDataset(path=path, min_frames=1000))
+    check_contract(TidyDataset(path=path, min_duration=100))
 
 
 def test_real_ngsim(shared_data: Path) -> None:
     path = shared_data / "i80_0400_raw_sample.csv.gz"
-    check_contract(NgsimDataset(path=path, min_frames=650))
+    check_contract(NgsimDataset(path=path, min_duration=65))

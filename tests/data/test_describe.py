@@ -26,7 +26,7 @@ def test_describes_real_tidy_pairs(shared_data: Path) -> None:
         "Left out in reading: nothing",
     ):
         assert words in text
-    line = next(line for line in text.splitlines() if "at least 700" in line)
+    line = next(line for line in text.splitlines() if "at least 70 s" in line)
     assert line.split()[-1] == "71"
 
 
@@ -125,7 +125,7 @@ def test_a_broken_plugin_is_warned_of_and_stops_nothing(
 def advice(path: Path, pairs: PairSet) -> list[str]:
     """Writes pairs; returns the options behind the path of the line to use, and what stands below.
 
-    A job leaves out pairs of fewer than 700 frames, unless told otherwise.
+    A job leaves out pairs of less than 10 s, unless told otherwise.
     """
     write_tidy(pairs, path)
     used, kept = describe(path).text.splitlines()[-2:]
@@ -136,11 +136,11 @@ def advice(path: Path, pairs: PairSet) -> list[str]:
 @pytest.mark.parametrize(
     ("lengths", "options", "kept"),
     [
-        ([430, 260, 380], "data.min_frames=350", (2, 3)),
-        ([30, 20], "data.min_frames=20", (2, 2)),
-        ([700, 20], "", (1, 2)),
-        ([700, 320, 310], "data.min_frames=300", (3, 3)),
-        ([700, 320, 100], "data.min_frames=300", (2, 3)),
+        ([43, 26, 38], "data.min_duration=3.8", (2, 3)),
+        ([30, 20], "data.min_duration=2", (2, 2)),
+        ([100, 20], "", (1, 2)),
+        ([100, 72, 71], "data.min_duration=5", (3, 3)),
+        ([100, 72, 30], "data.min_duration=5", (2, 3)),
     ],
 )
 def test_the_advice_keeps_at_least_half_of_the_pairs_and_says_what_it_leaves_out(
@@ -153,12 +153,14 @@ def test_the_advice_keeps_at_least_half_of_the_pairs_and_says_what_it_leaves_out
     if few == every:
         assert said[1] == f"It keeps all {every} pairs."
     else:
-        least = options.rpartition("=")[2] or "700"
+        least = options.rpartition("=")[2] or "10"
         assert said[1] == (
             f"It keeps {few} of {every} pairs and leaves out {every - few} shorter than {least}"
-            f" frames; data.min_frames={min(lengths)} keeps all."
+            f" s; data.min_duration={min(lengths) / 10:g} keeps all."
         )
-    given = {"path": path} | ({"min_frames": int(options.rpartition("=")[2])} if options else {})
+    given = {"path": path} | (
+        {"min_duration": float(options.rpartition("=")[2])} if options else {}
+    )
     assert len(TidyDataset(**given).load()) == few
 
 
@@ -171,5 +173,5 @@ def test_the_advice_brings_recordings_to_one_step(tmp_path: Path) -> None:
     ]
     both = PairSet((*slow, *fast), "both")
     path = tmp_path / "pairs.parquet"
-    assert advice(path, both) == ["data.time_step=0.1 data.min_frames=200", "It keeps all 2 pairs."]
-    assert len(TidyDataset(path=path, time_step=0.1, min_frames=200).load()) == 2
+    assert advice(path, both) == ["data.time_step=0.1", "It keeps all 2 pairs."]
+    assert len(TidyDataset(path=path, time_step=0.1).load()) == 2

@@ -132,7 +132,7 @@ def test_a_job_is_refused_warned_or_left_alone(
     frame.to_csv(path, index=False)
 
     def dataset(**more: object) -> Dataset:
-        return TidyDataset(path=path, min_frames=100, **more)
+        return TidyDataset(path=path, min_duration=10, **more)
 
     with pytest.raises(DataError) as error:
         dataset().load()
@@ -153,7 +153,7 @@ def test_every_dataset_is_checked(tmp_path: Path) -> None:
             return PairSet((times(-1, *ACCELERATIONS),), "a plugin's")
 
     with pytest.raises(DataError, match=r"a plugin's: one of 1 pairs.*sign is turned"):
-        Theirs(min_frames=2).load()
+        Theirs(min_duration=0).load()
 
 
 def test_only_some_pairs_are_named_and_all_counted() -> None:
@@ -172,14 +172,14 @@ SHARED = ROOT.parent / "shared" / "data"
 @pytest.mark.parametrize("path", sorted(SHARED.glob("*.[pc]*")), ids=lambda path: path.name)
 def test_real_recordings_are_let_through(path: Path) -> None:
     kind = TidyDataset if path.suffix == ".parquet" else NgsimDataset
-    dataset = kind(path=path, min_frames=20, check="off", accelerations="recorded")
+    dataset = kind(path=path, min_duration=0, check="off", accelerations="recorded")
     assert not list(contradictions(dataset.load()))
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
 def test_a_few_pairs_of_a_real_recording_are_let_through() -> None:
     path = SHARED / "openacc_zalazone_pairs.parquet"
-    pairs = TidyDataset(path=path, min_frames=900, check="off", accelerations="recorded").load()
+    pairs = TidyDataset(path=path, min_duration=90, check="off", accelerations="recorded").load()
     for count in (4, 6, 8, 12):
         for first in range(0, len(pairs) - count, count):
             assert typical_contradiction(PairSet(pairs[first : first + count], "some")) is None

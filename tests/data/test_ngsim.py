@@ -219,12 +219,12 @@ def test_recordings_are_told_apart_by_place_and_clock(tmp_path: Path) -> None:
         "vehicle 2 of one recording is not vehicle 2 of another"
     )
     assert [pair.site for pair in pairs] == [*["i-80"] * 6, *["us-101"] * 2]
-    chosen = NgsimDataset(path=path, location="US-101", min_frames=2).load()
+    chosen = NgsimDataset(path=path, location="US-101", min_duration=0).load()
     assert [pair.pair_id for pair in chosen] == ["us-101-2-1", "us-101-3-2"]
     assert counts(chosen)["other locations than 'US-101'"] == 450
-    assert len(NgsimDataset(path=path, recording="i-80-2", min_frames=2).load()) == 2
+    assert len(NgsimDataset(path=path, recording="i-80-2", min_duration=0).load()) == 2
     with pytest.raises(DataError, match=r"no such location. Did you mean 'us-101'\? Known: "):
-        NgsimDataset(path=path, location="us101", min_frames=2).load()
+        NgsimDataset(path=path, location="us101", min_duration=0).load()
 
 
 @pytest.mark.parametrize(
@@ -356,7 +356,9 @@ def test_both_ends_of_every_vehicle_are_left_out_if_wanted(tmp_path: Path) -> No
         [traffic(), vehicle(4, 3, 0.0, range(10, 25))], ignore_index=True
     )  # the last one is too short to be left
     path = save(rows, tmp_path / "f.csv")
-    whole, pairs = (NgsimDataset(path=path, min_frames=2, trim=trim).load() for trim in (0.0, 1.0))
+    whole, pairs = (
+        NgsimDataset(path=path, min_duration=0, trim=trim).load() for trim in (0.0, 1.0)
+    )
     assert [(pair.pair_id, pair.first_frame, len(pair)) for pair in pairs] == [
         ("f-2-1", 20, 30),
         ("f-3-2", 20, 30),
@@ -379,10 +381,10 @@ def test_boundary_artefacts_are_said_until_they_are_left_out(
     rows.loc[rows.Frame_ID < 40, "v_Acc"] = 4.5
     smoothed = save(rows, tmp_path / "smoothed.csv")
     with caplog.at_level("INFO"):
-        NgsimDataset(path=straight, min_frames=2, accelerations="recorded").load()
-        NgsimDataset(path=smoothed, min_frames=2, trim=3, accelerations="recorded").load()
+        NgsimDataset(path=straight, min_duration=0, accelerations="recorded").load()
+        NgsimDataset(path=smoothed, min_duration=0, trim=3, accelerations="recorded").load()
         assert not caplog.messages
-        NgsimDataset(path=smoothed, min_frames=2, check="off", accelerations="recorded").load()
+        NgsimDataset(path=smoothed, min_duration=0, check="off", accelerations="recorded").load()
     assert len(caplog.messages) == 1
     assert "accelerate by +1.4 and +0.2 m/s2 on average (+0.2 between)" in caplog.messages[0]
     assert "data.trim=3" in describe(smoothed).text
@@ -394,7 +396,7 @@ def test_boundary_artefacts_are_said_until_they_are_left_out(
 
 @pytest.fixture(scope="module")
 def raw(shared_data: Path) -> PairSet:
-    return NgsimDataset(path=shared_data / "i80_0400_raw_sample.csv.gz", min_frames=300).load()
+    return NgsimDataset(path=shared_data / "i80_0400_raw_sample.csv.gz", min_duration=30).load()
 
 
 def test_raw_sample_has_142_pairs(raw: PairSet) -> None:
@@ -511,7 +513,7 @@ def test_a_unit_is_told_from_feet(
     raw = pd.read_csv(shared_data / "i80_0400_raw_sample.csv.gz").query("Lane_ID == 2")
     save(raw.assign(v_Vel=raw["v_Vel"] * factor), tmp_path / "f.csv")
     with pytest.raises(DataError, match=f"the speeds look like {unit}, not ft/s"):
-        NgsimDataset(path=tmp_path / "f.csv", min_frames=300).load()
+        NgsimDataset(path=tmp_path / "f.csv", min_duration=30).load()
 
 
 def test_files_that_cannot_be_read(rows: pd.DataFrame, tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def written(tmp_path: Path, frame: pd.DataFrame | None = None) -> Path:
 
 
 def load(path: Path, **more: object) -> PairSet:
-    settings = {"columns": COLUMNS, "units": UNITS, "min_frames": 100, **more}
+    settings = {"columns": COLUMNS, "units": UNITS, "min_duration": 10, **more}
     return TidyDataset(path=path, **settings).load()
 
 

@@ -82,7 +82,7 @@ def test_other_recordings_are_not_read(folder: Path, monkeypatch: pytest.MonkeyP
         return read_tidy(path, layout)
 
     monkeypatch.setattr(tidy, "read_tidy", counted)
-    found = TidyDataset(path=folder, recording="us 101", min_frames=2).load()
+    found = TidyDataset(path=folder, recording="us 101", min_duration=0).load()
     assert [pair.recording for pair in found] == ["us 101"] * 2
     assert len(read) == 1
 

@@ -60,32 +60,38 @@ def names(dataset: Dataset) -> list[str]:
     return [pair.pair_id for pair in dataset.load()]
 
 
-def test_keeps_what_is_long_enough_and_counts_the_rest() -> None:
-    kept = Ready(min_frames=30).load()
+def test_keeps_what_is_long_enough_counts_the_rest_and_warns_of_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    kept = Ready(min_duration=3).load()
     assert [pair.pair_id for pair in kept] == ["b", "c", "d"]
-    assert kept.dropped == (Dropped("of no use", 7, "rows"), Dropped("shorter than 30 frames", 1))
+    assert caplog.messages == [
+        "made up: 1 of 4 pairs are left out, which last less than data.min_duration=3 s;"
+        " data.min_duration=1 keeps all"
+    ]
+    assert kept.dropped == (Dropped("of no use", 7, "rows"), Dropped("shorter than 3 s", 1))
 
 
 def test_keeps_the_first_max_pairs_and_counts_the_rest() -> None:
-    kept = Ready(min_frames=2, max_pairs=3).load()
+    kept = Ready(min_duration=0, max_pairs=3).load()
     assert [pair.pair_id for pair in kept] == ["a", "b", "c"]
     assert kept.dropped[-1] == Dropped("beyond max_pairs (3)", 1)
 
 
 def test_selects_a_recording_and_lanes() -> None:
-    assert names(Ready(min_frames=2, recording="other")) == ["d"]
-    assert names(Ready(min_frames=2, lanes=[3])) == ["c", "d"]
-    assert names(Ready(min_frames=2, lanes=[2, 3], recording="r")) == ["b", "c"]
+    assert names(Ready(min_duration=0, recording="other")) == ["d"]
+    assert names(Ready(min_duration=0, lanes=[3])) == ["c", "d"]
+    assert names(Ready(min_duration=0, lanes=[2, 3], recording="r")) == ["b", "c"]
 
 
 def test_selects_pairs_by_their_ids() -> None:
-    kept = Ready(min_frames=2, pair_ids=["d", "b"]).load()
+    kept = Ready(min_duration=0, pair_ids=["d", "b"]).load()
     assert [pair.pair_id for pair in kept] == ["b", "d"]
     assert kept.dropped[-1] == Dropped("other pairs than data.pair_ids", 2)
 
 
 def test_every_pair_is_kept_or_counted() -> None:
-    kept = Ready(min_frames=30, lanes=[3], max_pairs=1).load()
+    kept = Ready(min_duration=3, lanes=[3], max_pairs=1).load()
     assert len(kept) + sum(d.count for d in kept.dropped if d.unit == "pairs") == len(PAIRS)
 
 
@@ -93,24 +99,24 @@ def test_every_pair_is_kept_or_counted() -> None:
     ("options", "said"),
     [
         (
-            {"min_frames": 60},
-            "none of its 4 pairs has at least 60 frames, the longest has 50; lower data.min_frames",
+            {"min_duration": 6},
+            "none of its 4 pairs lasts 6 s, the longest lasts 5 s; lower data.min_duration",
         ),
         (
-            {"min_frames": 30, "max_pairs": 5},
-            "asked for 5 pairs but only 3 have at least 30 frames; lower data.max_pairs",
+            {"min_duration": 3, "max_pairs": 5},
+            "asked for 5 pairs but only 3 last 3 s; lower data.max_pairs",
         ),
         (
-            {"min_frames": 2, "recording": "othr"},
+            {"min_duration": 0, "recording": "othr"},
             "there is no recording 'othr'. Did you mean 'other'? Known: r, other.",
         ),
-        ({"min_frames": 2, "lanes": [9]}, "there is no lane '9'. Known: 2, 3."),
-        ({"min_frames": 2, "lanes": []}, "the list is empty. Known: 2, 3."),
+        ({"min_duration": 0, "lanes": [9]}, "there is no lane '9'. Known: 2, 3."),
+        ({"min_duration": 0, "lanes": []}, "the list is empty. Known: 2, 3."),
         (
-            {"min_frames": 2, "pair_ids": ["bb"]},
+            {"min_duration": 0, "pair_ids": ["bb"]},
             "there is no pair 'bb'. Did you mean 'b'? Known: a, b, c, d.",
         ),
-        ({"min_frames": 2, "pair_ids": []}, "the list is empty. Known: a, b, c, d."),
+        ({"min_duration": 0, "pair_ids": []}, "the list is empty. Known: a, b, c, d."),
     ],
 )
 def test_says_what_was_found_and_what_to_change(options: dict[str, object], said: str) -> None:
@@ -124,7 +130,7 @@ def test_lanes_need_data_that_knows_them() -> None:
         pairs = PairSet((a_pair("a", 10),), "made up")
 
     with pytest.raises(DataError, match="does not say in which lane"):
-        Laneless(min_frames=2, lanes=[1]).load()
+        Laneless(min_duration=0, lanes=[1]).load()
 
 
 def test_no_pair_at_all_is_an_error_that_says_why() -> None:
@@ -139,7 +145,8 @@ def test_no_pair_at_all_is_an_error_that_says_why() -> None:
 
 
 @pytest.mark.parametrize(
-    "options", [{"min_frames": 1}, {"max_pairs": 0}, {"min_frames": float("nan")}, {"frames": 3}]
+    "options",
+    [{"min_duration": -1}, {"max_pairs": 0}, {"min_duration": float("nan")}, {"frames": 3}],
 )
 def test_refuses_settings_that_make_no_sense(options: dict[str, object]) -> None:
     with pytest.raises(ConfigError):

@@ -42,25 +42,25 @@ def test_a_list_and_a_pattern_name_the_same_files(
 ) -> None:
     files = written(tmp_path / "day", drives("a", 20, 30), drives("b", 41))
     monkeypatch.chdir(tmp_path)
-    listed = TidyDataset(path=["day/b.csv", "day/a.csv"], min_frames=2).load()
+    listed = TidyDataset(path=["day/b.csv", "day/a.csv"], min_duration=0).load()
     assert [pair.pair_id for pair in listed] == ["b-0", "a-0", "a-1"]
-    found = TidyDataset(path="day/*.csv", min_frames=2).load()
+    found = TidyDataset(path="day/*.csv", min_duration=0).load()
     assert [pair.pair_id for pair in found] == ["a-0", "a-1", "b-0"]
     assert found.source == f"2 files ({files[0]}, {files[1]})"
     assert (
         found.fingerprint
-        == joined([TidyDataset(path=file, min_frames=2).load() for file in files]).fingerprint
+        == joined([TidyDataset(path=file, min_duration=0).load() for file in files]).fingerprint
     )
-    assert [pair.pair_id for pair in TidyDataset(path="day/[b].csv", min_frames=2).load()] == [
+    assert [pair.pair_id for pair in TidyDataset(path="day/[b].csv", min_duration=0).load()] == [
         "b-0"
     ]
 
 
 def test_what_is_left_out_is_selected_and_counted_over_all_files(tmp_path: Path) -> None:
     files = written(tmp_path, drives("a", 20, 30), drives("b", 20, 41))
-    pairs = TidyDataset(path=files, min_frames=30).load()
+    pairs = TidyDataset(path=files, min_duration=3).load()
     assert [pair.pair_id for pair in pairs] == ["a-1", "b-1"]
-    assert pairs.dropped == (Dropped("shorter than 30 frames", 2),)
+    assert pairs.dropped == (Dropped("shorter than 3 s", 2),)
     one = PairSet(drives("c", 9).pairs, "one", (Dropped("no leader", 2, "rows"), Dropped("odd", 1)))
     other = PairSet(drives("d", 8).pairs, "other", (Dropped("no leader", 3, "rows"),))
     assert joined([one, other]).dropped == (Dropped("no leader", 5, "rows"), Dropped("odd", 1))
@@ -68,13 +68,13 @@ def test_what_is_left_out_is_selected_and_counted_over_all_files(tmp_path: Path)
 
 def test_a_name_that_looks_like_a_pattern_is_a_file_where_there_is_one(tmp_path: Path) -> None:
     (file,) = written(tmp_path, replace(drives("a", 20), source="day[1]"))
-    assert len(TidyDataset(path=file, min_frames=2).load()) == 1
+    assert len(TidyDataset(path=file, min_duration=0).load()) == 1
 
 
 def test_a_recording_may_go_on_in_another_file(tmp_path: Path) -> None:
     both = drives("a", 20, 30)
     files = written(tmp_path, *(PairSet((pair,), f"part{k}") for k, pair in enumerate(both)))
-    assert {pair.recording for pair in TidyDataset(path=files, min_frames=2).load()} == {"a"}
+    assert {pair.recording for pair in TidyDataset(path=files, min_duration=0).load()} == {"a"}
 
 
 @pytest.mark.parametrize("renamed", [False, True])
@@ -88,7 +88,7 @@ def test_a_pair_that_stands_in_two_files_is_refused(tmp_path: Path, renamed: boo
     files = written(tmp_path, both, PairSet((again,), "b"))
     name = "pair 'a-1', there 'other'," if renamed else "pair 'a-1'"
     with pytest.raises(DataError) as error:
-        TidyDataset(path=files, min_frames=2).load()
+        TidyDataset(path=files, min_duration=0).load()
     assert (
         str(error.value)
         == f"{files[0]} and {files[1]}: {name} stands in both files; leave it out of one of them"
@@ -132,7 +132,7 @@ def test_recordings_of_ngsim_files_are_named_apart(tmp_path: Path) -> None:
         save(moved(CLOCK + k * day, 1.0 * k), tmp_path / f"0{4 + k}00.txt", "text")
         for k in range(2)
     ]
-    pairs = NgsimDataset(path=plain, min_frames=2).load()
+    pairs = NgsimDataset(path=plain, min_duration=0).load()
     assert [pair.driver for pair in pairs] == ["0400/2", "0400/3", "0500/2", "0500/3"]
     located = [
         save(
@@ -142,10 +142,10 @@ def test_recordings_of_ngsim_files_are_named_apart(tmp_path: Path) -> None:
         )
         for k in range(2)
     ]
-    pairs = NgsimDataset(path=located, min_frames=2, location="i-80").load()
+    pairs = NgsimDataset(path=located, min_duration=0, location="i-80").load()
     assert sorted({pair.recording for pair in pairs}) == ["part0-i-80", "part1-i-80"]
-    assert NgsimDataset(path=located[0], min_frames=2).load()[0].recording == "i-80"
-    mixed = NgsimDataset(path=[plain[0], located[1]], min_frames=2).load()
+    assert NgsimDataset(path=located[0], min_duration=0).load()[0].recording == "i-80"
+    mixed = NgsimDataset(path=[plain[0], located[1]], min_duration=0).load()
     assert sorted({pair.recording for pair in mixed}) == ["0400", "i-80"]
 
 
@@ -157,12 +157,12 @@ def test_ngsim_files_that_cannot_be_told_apart_are_refused(tmp_path: Path) -> No
     with pytest.raises(
         DataError, match="both recordings would be called 'trajectories'; rename one of the files"
     ):
-        NgsimDataset(path=files, min_frames=2).load()
+        NgsimDataset(path=files, min_duration=0).load()
     again = save(moved(CLOCK, 0.0), tmp_path / "copy.txt", "text")
     with pytest.raises(
         DataError, match="pair 'trajectories-2-1', there 'copy-2-1', stands in both files"
     ):
-        NgsimDataset(path=[files[0], again], min_frames=2).load()
+        NgsimDataset(path=[files[0], again], min_duration=0).load()
 
 
 def test_settings_with_several_files_are_written_without_complaint(tmp_path: Path) -> None:

@@ -43,7 +43,7 @@ def written(folder: Path, name: str, *pairs: Pair) -> Path:
 
 
 def loaded(*paths: Path, **options: Any) -> PairSet:
-    return TidyDataset(path=[str(path) for path in paths], min_frames=2, **options).load()
+    return TidyDataset(path=[str(path) for path in paths], min_duration=0, **options).load()
 
 
 @pytest.fixture

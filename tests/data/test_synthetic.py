@@ -138,7 +138,7 @@ def test_true_parameters_vary_as_asked_and_stay_in_bounds(model: str) -> None:
                 "held for half a second"
             )
             assert values.std() > 0
-    for pair in made(model=model, variation=0.0, heterogeneity=0.0, frames=20, min_frames=2):
+    for pair in made(model=model, variation=0.0, heterogeneity=0.0, frames=20, min_duration=0):
         for name, values in pair.truth.items():
             assert values == pytest.approx(space[name].default)
             assert np.ptp(values) == 0
@@ -146,7 +146,7 @@ def test_true_parameters_vary_as_asked_and_stay_in_bounds(model: str) -> None:
 
 def test_the_seed_decides() -> None:
     first, again, other = (
-        SyntheticDataset(pairs=3, frames=60, seed=seed, min_frames=2).load() for seed in (0, 0, 1)
+        SyntheticDataset(pairs=3, frames=60, seed=seed, min_duration=0).load() for seed in (0, 0, 1)
     )
     assert first.fingerprint == again.fingerprint != other.fingerprint
 
@@ -168,7 +168,7 @@ def test_noise_belongs_to_the_vehicle_and_leaves_the_truth_alone() -> None:
 
 
 def test_pairs_that_noise_turns_around_are_counted() -> None:
-    pairs = SyntheticDataset(pairs=8, frames=300, noise_position_m=6.0, min_frames=2).read()
+    pairs = SyntheticDataset(pairs=8, frames=300, noise_position_m=6.0, min_duration=0).read()
     (dropped,) = pairs.dropped
     assert len(pairs) + dropped.count == 8
     assert "noise" in dropped.reason

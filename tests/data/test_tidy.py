@@ -118,12 +118,13 @@ def test_a_table_reads_as_a_file_does(good: pd.DataFrame, tmp_path: Path) -> Non
 def test_real_pairs(shared_data: Path, i80_pairs: PairSet) -> None:
     path = shared_data / "i80_reconstructed_pairs.parquet"
     assert len(i80_pairs) == 229
-    assert len(TidyDataset(path=path).load()) == 71
+    assert len(TidyDataset(path=path).load()) == 229
+    assert len(TidyDataset(path=path, min_duration=70).load()) == 71
     with pytest.raises(
         DataError,
-        match="asked for 50 pairs but only 26 have at least 700 frames in the selected recording",
+        match="asked for 50 pairs but only 26 last 70 s in the selected recording",
     ):
-        TidyDataset(path=path, recording="i80-0400", max_pairs=50).load()
+        TidyDataset(path=path, recording="i80-0400", min_duration=70, max_pairs=50).load()
 
 
 # --- round trip -----------------------------------------------------------------------------------
@@ -185,7 +186,7 @@ def test_round_trip_is_exact(
 def test_synthetic_pairs_survive_with_their_truth(tmp_path: Path) -> None:
     pairs = SyntheticDataset(pairs=3, frames=40, platoon_size=2).load()
     write_tidy(pairs, tmp_path / "s.parquet")
-    again = TidyDataset(path=tmp_path / "s.parquet", min_frames=2).load()
+    again = TidyDataset(path=tmp_path / "s.parquet", min_duration=0).load()
     same(pairs, again)
     assert again.fingerprint == pairs.fingerprint
 
@@ -430,13 +431,13 @@ def test_who_drives_is_kept_and_selected(good: pd.DataFrame, tmp_path: Path) -> 
     path = tmp_path / "t.csv"
     labelled.to_csv(path, index=False)
     assert [pair.driver_type for pair in read_tidy(path)] == ["human", "acc"]
-    pairs = TidyDataset(path=path, min_frames=2, driver_type="acc").load()
+    pairs = TidyDataset(path=path, min_duration=0, driver_type="acc").load()
     assert [pair.pair_id for pair in pairs] == ["q"]
     assert pairs.dropped[-1].count == 1
     write_tidy(read_tidy(path), tmp_path / "again.parquet")
     same(read_tidy(path), read_tidy(tmp_path / "again.parquet"))
     with pytest.raises(DataError, match="does not say what drives"):
-        TidyDataset(path=path, min_frames=2, leader_driver_type="acc").load()
+        TidyDataset(path=path, min_duration=0, leader_driver_type="acc").load()
 
 
 def test_a_driver_that_changes_within_a_pair_is_refused(good: pd.DataFrame, tmp_path: Path) -> None:

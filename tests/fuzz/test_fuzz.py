@@ -130,7 +130,7 @@ def examined(path: Path) -> None:
     """Loads and describes a file; only sentences may come of it."""
     for read in (TidyDataset, NgsimDataset):
         try:
-            read(path=path, min_frames=2).load()
+            read(path=path, min_duration=0).load()
         except CfxError as error:
             said(error)
     try:

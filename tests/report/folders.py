@@ -80,7 +80,7 @@ def write_job(
     made.style.table.to_csv(folder / "style.csv", index=False)
     evaluation.trajectories_table().to_parquet(folder / "trajectories.parquet", index=False)
     made.curves.astype({"network": str}).to_parquet(folder / "curves.parquet", index=False)
-    dropped = [{"reason": "fewer than 700 frames", "count": 12, "unit": "pairs"}]
+    dropped = [{"reason": "shorter than 70 s", "count": 12, "unit": "pairs"}]
     units = [{"name": p.name, "unit": p.unit, "low": p.low, "high": p.high} for p in space.tuned]
     data = {
         "source": source,

@@ -126,7 +126,7 @@ def test_the_page_has_every_section(clusters: Clusters) -> None:
     assert figures
     assert all(one["role"] == "img" and one["aria-label"] for one in figures)
     assert sum(tag == "svg" for tag, _ in page.elements) >= len(figures)
-    assert "12 pairs (fewer than 700 frames)" in page.words
+    assert "12 pairs (shorter than 70 s)" in page.words
     assert "secret" not in page.words
 
 

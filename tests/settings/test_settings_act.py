@@ -41,7 +41,7 @@ EXCEPTIONS = {
     "demo": "shows the results, on a page beside them; tests of demonstrations write it",
     "model.parameters.emergencyDecel.default": "no driver here has to brake so hard",
     "data.check": "recordings that contradict themselves are refused; these do not",
-    "data.min_frames": "all of these pairs are longer",
+    "data.min_duration": "all of these pairs are longer",
     "data.site": "a name",
     "data.vehicle": "a name",
     "protocol.run": "another job's folder",
@@ -71,7 +71,7 @@ VALUES: dict[str, list[Any]] = {
     "learner.gradient_clip": [1e-4],
     "learner.head": ["offset", "residual"],
     "protocol.histories": [[5]],
-    "protocol.min_test_frames": [41, 201],
+    "protocol.min_test_duration": [4.1, 20.1],
     "protocol.noise": [[5.0, 0.2]],
     "metrics": [["rmse_speed", "rmse_gap", "collisions"]],
 }

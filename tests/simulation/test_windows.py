@@ -49,9 +49,9 @@ def test_windows_come_back_from_their_grid() -> None:
 
 def test_a_pair_that_is_too_short_says_how_long_it_must_be() -> None:
     settings = WindowSettings()
-    with pytest.raises(DataError, match=r"pair p0 has 9 frames.*at least 16") as caught:
+    with pytest.raises(DataError, match=r"pair p0 has 9 frames.*at least 1.6") as caught:
         Split.of(straight_pairs([9]), settings, 0.8)
-    needed = int(str(caught.value).rsplit(" ", 1)[1])
+    needed = round(10 * float(str(caught.value).rsplit(" ", 1)[1]))
     Split.of(straight_pairs([needed]), settings, 0.8)
     with pytest.raises(DataError):
         Split.of(straight_pairs([needed - 1]), settings, 0.8)

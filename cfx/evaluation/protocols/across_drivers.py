@@ -46,10 +46,10 @@ class AcrossDriversSettings(Settings):
         " cruise control and without; recording, site: all drivers of a recording or of a site"
         " (data.site), so that no network learned from the road it is tested on",
     )
-    min_test_frames: int | None = Field(
+    min_test_duration: float | None = Field(
         None,
-        ge=1,
-        description="frames a pair must have to be tested; shorter ones are only learned from;"
+        gt=0,
+        description="s that a pair must last to be tested; shorter ones are only learned from;"
         " null: all are tested",
     )
     base: Literal["own", "population", "default"] = Field(
@@ -221,7 +221,7 @@ class AcrossDrivers(Protocol):
             DataError: there are fewer drivers (platoons, recordings) than folds.
         """
         s = self.settings
-        return assign_folds(pairs, s.folds, s.together, s.min_test_frames, seed=seed)
+        return assign_folds(pairs, s.folds, s.together, s.min_test_duration, seed=seed)
 
     def _calibrated(
         self, context: ProtocolContext, fixed: Tensor, population: Tensor, labels: Labels | None

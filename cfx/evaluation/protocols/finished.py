@@ -198,13 +198,13 @@ class FoldsOrFinished(AcrossDrivers):
         Raises:
             DataError: none is.
         """
-        least = self.settings.min_test_frames
+        least = self.settings.min_test_duration
         if least is None:
             return context
-        long = [number for number, pair in enumerate(context.pairs) if len(pair) >= least]
+        long = [number for number, pair in enumerate(context.pairs) if pair.lasts(least)]
         if not long:
             raise DataError(
-                f"no pair in {context.pairs.source} has protocol.min_test_frames={least} frames;"
+                f"no pair in {context.pairs.source} lasts protocol.min_test_duration={least:g} s;"
                 " lower it"
             )
         if len(long) == len(context.pairs):

@@ -30,7 +30,7 @@ Together = Literal["driver", "platoon", "vehicle", "recording", "site"]
 
 
 def assign_folds(
-    pairs: PairSet, folds: int | None, together: Together, min_frames: int | None, *, seed: int
+    pairs: PairSet, folds: int | None, together: Together, min_duration: float | None, *, seed: int
 ) -> Tensor:
     """Returns the fold of each pair, `(P,)` int64.
 
@@ -41,7 +41,7 @@ def assign_folds(
         folds: K; None: as many as there are drivers (platoons, ...), one of which is left out
             at a time.
         together: what a fold keeps together.
-        min_frames: frames that a tested pair has at least; None: all are tested.
+        min_duration: s that a tested pair lasts at least; None: all are tested.
         seed: of the shuffle.
 
     Raises:
@@ -51,12 +51,12 @@ def assign_folds(
     groups = _groups(pairs, together)
     tested = []
     for number, pair in enumerate(pairs):
-        if min_frames is None or len(pair) >= min_frames:
+        if min_duration is None or pair.lasts(min_duration):
             tested.append(number)
     groups_tested = [groups[number] for number in tested]
     found = len(set(groups_tested))
     if found < (folds or 2):
-        raise DataError(_too_few(pairs, folds, together, min_frames, found))
+        raise DataError(_too_few(pairs, folds, together, min_duration, found))
     if folds is None:
         folds = found
     splitter = GroupKFold(folds, shuffle=True, random_state=seed)
@@ -100,15 +100,15 @@ def learned_from(fold: Tensor, folds: int) -> Tensor:
 
 
 def _too_few(
-    pairs: PairSet, folds: int | None, together: Together, min_frames: int | None, found: int
+    pairs: PairSet, folds: int | None, together: Together, min_duration: float | None, found: int
 ) -> str:
     what = together if found == 1 else f"{together}s"
-    if min_frames:
-        what += f" with {min_frames} frames or more"
+    if min_duration:
+        what += f" whose pairs last {min_duration:g} s"
     if together == "site" and found == 1:
         what += " (name those of its recordings with data.site)"
     more = f"{together}s" if together in {"recording", "site", "vehicle"} else "pairs"
-    lower = f"lower protocol.min_test_frames={min_frames} or " if min_frames else ""
+    lower = f"lower protocol.min_test_duration={min_duration:g} or " if min_duration else ""
     if folds is None:
         return (
             f"protocol.together={together}: {pairs.source} has only {found} {what} here, and one is"

@@ -82,17 +82,17 @@ def max_pairs_keeps_the_first_and_counts_the_rest(dataset: Dataset) -> None:
 
 def asking_for_too_much_is_an_error(dataset: Dataset) -> None:
     pairs = _loaded(dataset)
-    longest = max(len(pair) for pair in pairs)
+    longest = max(pair.duration for pair in pairs)
     said = None
     try:
-        _with(dataset, min_frames=longest + 1).load()
+        _with(dataset, min_duration=2 * longest).load()
     except DataError as error:
         said = str(error)
     assert said is not None, (
         "where no pair is left `load` must raise DataError: no job can go on without pairs"
     )
-    assert "min_frames" in said, (
-        "where no pair is long enough the DataError must name min_frames, for users to change:"
+    assert "min_duration" in said, (
+        "where no pair is long enough the DataError must name min_duration, for users to change:"
         f" {said}"
     )
 

@@ -35,9 +35,6 @@ _UNPICKLE = (
 class FollowernetSettings(FileDatasetSettings):
     """What the arrays do not say of themselves."""
 
-    min_frames: int = Field(
-        150, ge=2, description="shortest event that is kept, frames; 375 are 15 s of HighD's"
-    )
     recorded_step: float = Field(
         0.1,
         ge=0.001,

@@ -58,9 +58,6 @@ _LEFT, _RIGHT = 1, 2
 class HighdSettings(FileDatasetSettings):
     """Which part of a highD recording to read."""
 
-    min_frames: int = Field(
-        375, ge=2, description="shortest pair that is kept, frames; 375 are 15 s at 25 Hz"
-    )
     max_gap: float | None = Field(
         120.0, gt=0, description="m: farther vehicles are no leaders; null: all are"
     )
@@ -84,7 +81,7 @@ class HighdDataset(Dataset):
 
     The recordings are called `highd-XX`, and sites `highd-location-N` by the `locationId` of the
     recording's metadata (six stretches of motorway). Vehicles are seen for some 14 s only, so pairs
-    are short: `data.time_step=0.1 data.min_frames=150` gives them at 10 Hz, the step of NGSIM.
+    are short: `data.time_step=0.1` gives them at 10 Hz, the step of NGSIM.
     """
 
     layout = "highD tracks (m, 25 Hz)"

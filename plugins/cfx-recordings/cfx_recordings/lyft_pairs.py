@@ -47,7 +47,6 @@ _TYPES = {"H": "human", "A": "automated"}
 class LyftPairsSettings(FileDatasetSettings):
     """How to read the Lyft pairs."""
 
-    min_frames: int = Field(150, ge=2, description="shortest pair that is kept, frames of 0.1 s")
     automated_length: float = Field(
         4.85, gt=0, le=100, description="m: of Lyft's own vehicles, whose size the stores leave out"
     )

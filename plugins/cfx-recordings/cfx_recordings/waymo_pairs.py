@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from pydantic import Field
 
 from cfx import PairSet, Settings
 from cfx.core.errors import DataError
@@ -51,14 +50,6 @@ _LAYOUT = Layout(
 )
 
 
-class WaymoPairsSettings(FileDatasetSettings):
-    """How to read the Waymo pairs."""
-
-    min_frames: int = Field(
-        150, ge=2, description="shortest pair that is kept, frames; segments last 20 s"
-    )
-
-
 class WaymoPairsDataset(Dataset):
     """Pairs of one CSV file, `all_seg_paired_cf_trj_final_with_large_vehicle.csv` for instance.
 
@@ -74,8 +65,8 @@ class WaymoPairsDataset(Dataset):
     """
 
     layout = "Waymo car-following pairs (Hu et al. 2022)"
-    schema: ClassVar[type[Settings]] = WaymoPairsSettings
-    settings: WaymoPairsSettings
+    schema: ClassVar[type[Settings]] = FileDatasetSettings
+    settings: FileDatasetSettings
 
     @classmethod
     def recognises(cls, start: FileStart) -> bool:

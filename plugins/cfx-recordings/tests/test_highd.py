@@ -23,7 +23,7 @@ SIGNALS = [
 
 def made_pairs(pairs: int = 3, frames: int = 150) -> cfx.PairSet:
     """Pairs whose speeds and positions belong together."""
-    made = cfx.get("dataset", "synthetic")(pairs=pairs, frames=frames, min_frames=2)
+    made = cfx.get("dataset", "synthetic")(pairs=pairs, frames=frames, min_duration=0)
     assert isinstance(made, cfx.Dataset)
     return made.load()
 
@@ -77,23 +77,23 @@ def write_highd(folder: Path, pairs: cfx.PairSet, number: str = "01") -> Path:
 
 def test_contract(tmp_path: Path) -> None:
     path = write_highd(tmp_path, made_pairs())
-    check_contract(HighdDataset(path=path, min_frames=100, max_gap=None))
+    check_contract(HighdDataset(path=path, min_duration=10, max_gap=None))
 
 
 def test_the_metadata_name_the_site(tmp_path: Path) -> None:
     path = write_highd(tmp_path, made_pairs(1))
-    read = HighdDataset(path=path, min_frames=2, max_gap=None).read()
+    read = HighdDataset(path=path, min_duration=0, max_gap=None).read()
     assert {pair.site for pair in read} == {"highd-location-1"}
     about = tmp_path / "01_recordingMeta.csv"
     pd.read_csv(about).drop(columns="locationId").to_csv(about, index=False)
-    read = HighdDataset(path=path, min_frames=2, max_gap=None).read()
+    read = HighdDataset(path=path, min_duration=0, max_gap=None).read()
     assert {pair.site for pair in read} == {""}
 
 
 def test_both_directions_give_the_trajectories_back(tmp_path: Path) -> None:
     made = made_pairs()
     path = write_highd(tmp_path, made)
-    pairs = HighdDataset(path=path, min_frames=2, max_gap=None).read()
+    pairs = HighdDataset(path=path, min_duration=0, max_gap=None).read()
     assert [len(pair) for pair in pairs] == [len(pair) for pair in made]
     for pair, original in zip(pairs, made, strict=True):
         for name in SIGNALS:
@@ -107,13 +107,13 @@ def test_both_directions_give_the_trajectories_back(tmp_path: Path) -> None:
 def test_recordings_are_told_apart(tmp_path: Path) -> None:
     for number in ("01", "02"):
         write_highd(tmp_path, made_pairs(frames=150 + int(number)), number)
-    pairs = HighdDataset(path=tmp_path / "*_tracks.csv", min_frames=2, max_gap=None).load()
+    pairs = HighdDataset(path=tmp_path / "*_tracks.csv", min_duration=0, max_gap=None).load()
     assert {pair.recording for pair in pairs} == {"highd-01", "highd-02"}
 
 
 def test_types_are_selected_and_the_others_counted(tmp_path: Path) -> None:
     path = write_highd(tmp_path, made_pairs())
-    options = {"path": path, "min_frames": 2, "max_gap": None}
+    options = {"path": path, "min_duration": 0, "max_gap": None}
     assert len(HighdDataset(**options, driver_type="car").load()) == 3
     with pytest.raises(DataError, match=r"driver_type=truck: .* no type .truck.*Known: car"):
         HighdDataset(**options, driver_type="truck").load()

@@ -26,7 +26,7 @@ from cfx_recordings.waymo_pairs import WaymoPairsDataset
 
 def made_pairs(pairs: int = 3, frames: int = 150) -> cfx.PairSet:
     """Pairs whose speeds and positions belong together."""
-    made = cfx.get("dataset", "synthetic")(pairs=pairs, frames=frames, min_frames=2)
+    made = cfx.get("dataset", "synthetic")(pairs=pairs, frames=frames, min_duration=0)
     assert isinstance(made, cfx.Dataset)
     return made.load()
 
@@ -151,14 +151,14 @@ READERS: dict[str, tuple[type[cfx.Dataset], Callable[[Path, cfx.PairSet], Path]]
 @pytest.mark.parametrize("name", READERS)
 def test_contract(name: str, tmp_path: Path) -> None:
     cls, write = READERS[name]
-    check_contract(cls(path=write(tmp_path, made_pairs()), min_frames=100))
+    check_contract(cls(path=write(tmp_path, made_pairs()), min_duration=10))
 
 
 @pytest.mark.parametrize("name", READERS)
 def test_gives_gaps_and_speeds_back(name: str, tmp_path: Path) -> None:
     cls, write = READERS[name]
     made = made_pairs()
-    pairs = cls(path=write(tmp_path, made), min_frames=2).load()
+    pairs = cls(path=write(tmp_path, made), min_duration=0).load()
     assert len(pairs) == len(made)
     for pair, original in zip(pairs, made, strict=True):
         np.testing.assert_allclose(pair.gap, original.gap, atol=1e-6)
@@ -182,13 +182,13 @@ def test_a_platoon_is_cut_where_the_driver_hands_over(tmp_path: Path) -> None:
     made = made_pairs(pairs=1, frames=100)
     drivers = {2: ["Human"] * 40 + ["ACC"] * 60}
     path = write_openacc(tmp_path / "a.csv", made, drivers=drivers)
-    pairs = OpenaccDataset(path=path, min_frames=2).load()
+    pairs = OpenaccDataset(path=path, min_duration=0).load()
     assert [(pair.driver_type, len(pair)) for pair in pairs] == [("human", 40), ("acc", 60)]
     assert {one.reason: one.count for one in pairs.ends} == {
         "the driver type changes": 1,
         "the source's pair ends": 1,
     }
-    (only,) = OpenaccDataset(path=path, min_frames=2, driver_type="acc").load()
+    (only,) = OpenaccDataset(path=path, min_duration=0, driver_type="acc").load()
     assert only.pair_id == "a-2-XC40-1-Golf-run2"
 
 
@@ -197,7 +197,7 @@ def test_the_line_above_the_table_says_who_drives_where_no_column_does(
     tmp_path: Path, acc: str, kind: str
 ) -> None:
     path = write_openacc(tmp_path / "a.csv", made_pairs(pairs=2), acc=acc)
-    pairs = OpenaccDataset(path=path, min_frames=2).load()
+    pairs = OpenaccDataset(path=path, min_duration=0).load()
     assert [pair.driver_type for pair in pairs] == [kind, kind]
     assert pairs[0].leader_driver_type == "", "nobody says how the first car is driven"
 
@@ -209,7 +209,7 @@ def test_empty_cells_and_missing_times_cut_a_pair_and_are_counted(tmp_path: Path
     lines[36] = ",".join([time, speed, east, follower, ""])
     del lines[66:76]
     path.write_text("\n".join(lines))
-    pairs = OpenaccDataset(path=path, min_frames=2).load()
+    pairs = OpenaccDataset(path=path, min_duration=0).load()
     assert [(pair.first_frame, len(pair)) for pair in pairs] == [(0, 30), (31, 29), (70, 30)]
     assert {one.reason: one.count for one in pairs.dropped} == {"a value is missing": 1}
     assert {one.reason for one in pairs.ends} == {
@@ -265,7 +265,7 @@ def test_events_come_in_any_kind_of_array(tmp_path: Path, kind: str) -> None:
     else:
         path = tmp_path / "events.npy"
         np.save(path, whole[0])
-    pairs = FollowernetDataset(path=path, min_frames=2).load()
+    pairs = FollowernetDataset(path=path, min_duration=0).load()
     assert [len(pair) for pair in pairs] == [150] * (1 if kind == "one" else 3)
     np.testing.assert_allclose(pairs[0].gap, made[0].gap, atol=1e-9)
 
@@ -321,7 +321,7 @@ def test_a_wrong_step_is_seen_in_the_spacings(tmp_path: Path) -> None:
 @pytest.mark.parametrize("name", ["waymo_pairs", "lyft_pairs", "openacc"])
 def test_times_in_other_steps_are_named(name: str, tmp_path: Path) -> None:
     cls, write = READERS[name]
-    slow = cfx.get("dataset", "synthetic")(pairs=3, frames=150, min_frames=2)
+    slow = cfx.get("dataset", "synthetic")(pairs=3, frames=150, min_duration=0)
     path = write(tmp_path, slow.load())  # type: ignore[attr-defined]  # a dataset
     if path.is_dir():
         import zarr
@@ -336,13 +336,13 @@ def test_times_in_other_steps_are_named(name: str, tmp_path: Path) -> None:
         table[column] *= 2.0
         path.write_text("\n".join([*above, table.to_csv(index=False)]))
     with pytest.raises(DataError, match=r"the time step is 0\.2 s, not the 0\.1 s"):
-        cls(path=path, min_frames=2).load()
+        cls(path=path, min_duration=0).load()
 
 
 def test_a_spacing_that_holds_a_vehicle_is_corrected(tmp_path: Path) -> None:
     made = made_pairs()
     path = npy(tmp_path, made)
-    pairs = FollowernetDataset(path=path, min_frames=2, vehicle_length=1.0).load()
+    pairs = FollowernetDataset(path=path, min_duration=0, vehicle_length=1.0).load()
     np.testing.assert_allclose(pairs[0].gap, made[0].gap - 1.0, atol=1e-9)
 
 
@@ -374,7 +374,7 @@ def test_waymo_uses_the_times_at_which_both_have_rows(tmp_path: Path) -> None:
     of_leader = table["local_veh_id"] == 7
     late = of_leader & (table["local_time"] < 1.95)
     table[~late].sample(frac=1.0, random_state=1).to_csv(path, index=False)
-    (pair,) = WaymoPairsDataset(path=path, min_frames=2).load()
+    (pair,) = WaymoPairsDataset(path=path, min_duration=0).load()
     assert len(pair) == 130
     np.testing.assert_allclose(pair.gap, made_pairs(pairs=1)[0].gap[20:], atol=1e-6)
 

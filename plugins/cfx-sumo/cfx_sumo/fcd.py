@@ -29,9 +29,6 @@ _LENGTH_IS_SUMOS = frozenset({"DEFAULT_VEHTYPE"})
 class SumoFcdSettings(FileDatasetSettings):
     """How to read SUMO's floating car data."""
 
-    min_frames: int = Field(
-        150, ge=2, description="shortest pair that is kept, frames of SUMO's step"
-    )
     max_gap: float | None = Field(
         120.0, gt=0, description="m: farther vehicles are no leaders; null: all are"
     )

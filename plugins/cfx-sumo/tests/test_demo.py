@@ -246,7 +246,7 @@ def test_real_leaders_are_followed_in_sumo_as_in_memory(
     data = [
         "data=tidy",
         f"data.path={shared_data / 'i80_reconstructed_pairs.parquet'}",
-        "data.min_frames=700",
+        "data.min_duration=70",
         "data.max_pairs=6",
     ]
     result = cfx.run(["experiment=sumo_demo", *data, *SMALL])

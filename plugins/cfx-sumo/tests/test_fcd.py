@@ -22,14 +22,14 @@ from tests.data.layouts import made_pairs, write_fcd
 @pytest.mark.parametrize("leaders", [True, False])
 def test_contract(leaders: bool, tmp_path: Path) -> None:
     path = write_fcd(tmp_path / "fcd.xml", made_pairs(), leaders=leaders)
-    check_contract(SumoFcdDataset(path=path, min_frames=100, max_gap=None))
+    check_contract(SumoFcdDataset(path=path, min_duration=10, max_gap=None))
 
 
 @pytest.mark.parametrize("leaders", [True, False])
 def test_gives_gaps_and_speeds_back(tmp_path: Path, leaders: bool) -> None:
     made = made_pairs()
     path = write_fcd(tmp_path / "fcd.xml", made, leaders=leaders, length=7.0)
-    pairs = SumoFcdDataset(path=path, min_frames=2, max_gap=None, lengths={"car": 7.0}).load()
+    pairs = SumoFcdDataset(path=path, min_duration=0, max_gap=None, lengths={"car": 7.0}).load()
     for pair, original in zip(pairs, made, strict=True):
         np.testing.assert_allclose(pair.gap, original.gap, atol=2e-6)
         np.testing.assert_allclose(pair.follower_speed, original.follower_speed, atol=1e-6)
@@ -113,7 +113,7 @@ def of_sumo(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_reads_what_sumo_writes(of_sumo: Path) -> None:
-    pairs = SumoFcdDataset(path=of_sumo, min_frames=50).load()
+    pairs = SumoFcdDataset(path=of_sumo, min_duration=5).load()
     assert len(pairs) > 5
     lengths = {pair.leader_driver_type: pair.leader_length for pair in pairs}
     assert lengths == {"car": 4.3, "truck": 12.0}, "lengths follow from gaps and positions"
@@ -129,11 +129,11 @@ def test_leaders_are_those_that_sumo_names(
     text = of_sumo.read_text()
     plain = tmp_path / "plain.xml"
     plain.write_text(text.replace("leaderGap=", "other=").replace("leaderID=", "another="))
-    options = {"min_frames": 50, "lengths": {"car": 4.3, "truck": 12.0}}
+    options = {"min_duration": 5, "lengths": {"car": 4.3, "truck": 12.0}}
     by_name = SumoFcdDataset(path=of_sumo, **options).load()
     by_place = SumoFcdDataset(path=plain, **options).load()
-    assert not caplog.messages
-    SumoFcdDataset(path=plain, min_frames=50, lengths={"car": 4.3}).read()
+    assert "how long vehicles are" not in caplog.text
+    SumoFcdDataset(path=plain, min_duration=5, lengths={"car": 4.3}).read()
     assert "how long vehicles are: those of type truck count as 5 m" in caplog.text
     gaps = {(p.follower_id, p.leader_id, p.first_frame): p.gap for p in by_place}
     matched = 0
@@ -161,7 +161,7 @@ def test_types_of_one_vehicle_are_the_type_they_came_from(of_sumo: Path) -> None
     path = of_sumo.with_name("own.xml")
     assert 'type="truck@t.0"' in path.read_text(), "SUMO gives the vehicle a type of its own"
     lengths = {"car": 4.3, "truck": 12.0}
-    pairs = SumoFcdDataset(path=path, min_frames=50, lengths=lengths).load()
+    pairs = SumoFcdDataset(path=path, min_duration=5, lengths=lengths).load()
     behind = [pair for pair in pairs if pair.leader_id == "t.0"]
     assert behind, "somebody follows it"
     assert {(pair.leader_driver_type, pair.leader_length) for pair in behind} == {("truck", 12.0)}
@@ -273,7 +273,7 @@ def _rows(path: Path) -> dict[tuple[str, int], dict[str, str]]:
 def test_parked_vehicles_neither_lead_nor_follow(kinds: Path, name: str) -> None:
     path = kinds / f"{name}.xml"
     rows = _rows(path)
-    pairs = SumoFcdDataset(path=path, min_frames=2, lengths=LENGTHS).read()
+    pairs = SumoFcdDataset(path=path, min_duration=0, lengths=LENGTHS).read()
     assert len(pairs) >= 2
     assert any(drop.reason == "parked beside the lane" for drop in pairs.dropped)
     for pair in pairs:
@@ -287,7 +287,7 @@ def test_parked_vehicles_neither_lead_nor_follow(kinds: Path, name: str) -> None
 def test_vehicles_side_by_side_in_a_lane_are_no_pair(kinds: Path, name: str) -> None:
     path = kinds / f"{name}.xml"
     rows = _rows(path)
-    pairs = SumoFcdDataset(path=path, min_frames=20, lengths=LENGTHS).load()
+    pairs = SumoFcdDataset(path=path, min_duration=2, lengths=LENGTHS).load()
     assert len(pairs) > 10
     for pair in pairs:
         frames = range(pair.first_frame, pair.first_frame + len(pair))
@@ -298,7 +298,7 @@ def test_vehicles_side_by_side_in_a_lane_are_no_pair(kinds: Path, name: str) -> 
 
 
 def test_vehicles_that_pass_each_other_in_a_lane_are_no_pair_there(kinds: Path) -> None:
-    pairs = SumoFcdDataset(path=kinds / "sublane-plain.xml", min_frames=2, lengths=LENGTHS).load()
+    pairs = SumoFcdDataset(path=kinds / "sublane-plain.xml", min_duration=0, lengths=LENGTHS).load()
     couples = {(pair.leader_id, pair.follower_id) for pair in pairs}
     assert couples, "cars still follow cars"
     assert not {(one, other) for other, one in couples} & couples
@@ -310,7 +310,7 @@ def test_oncoming_vehicles_are_no_pair(kinds: Path, name: str) -> None:
     rows = _rows(path)
     overtakes = [who for (who, _), row in rows.items() if row["lane"] == "e2_0" and who[0] == "f"]
     assert overtakes, "somebody overtakes in the lane of those who come towards it"
-    pairs = SumoFcdDataset(path=path, min_frames=2, max_gap=None, lengths=LENGTHS).load()
+    pairs = SumoFcdDataset(path=path, min_duration=0, max_gap=None, lengths=LENGTHS).load()
     assert {(pair.leader_id, pair.follower_id) for pair in pairs} >= {("on0", "on1")}
     for pair in pairs:
         ways = {rows[who, pair.first_frame]["angle"] for who in (pair.leader_id, pair.follower_id)}
@@ -324,8 +324,8 @@ def test_oncoming_vehicles_are_no_pair(kinds: Path, name: str) -> None:
 def test_every_format_gives_the_same_pairs(
     kinds: Path, name: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    expected = SumoFcdDataset(path=kinds / "same.xml", min_frames=2, lengths=LENGTHS).read()
-    pairs = SumoFcdDataset(path=kinds / name, min_frames=2, lengths=LENGTHS).read()
+    expected = SumoFcdDataset(path=kinds / "same.xml", min_duration=0, lengths=LENGTHS).read()
+    pairs = SumoFcdDataset(path=kinds / name, min_duration=0, lengths=LENGTHS).read()
     assert pairs.dropped == expected.dropped
     for pair, other in zip(pairs, expected, strict=True):
         assert (pair.pair_id, pair.driver_type) == (other.pair_id, other.driver_type)
@@ -336,7 +336,7 @@ def test_every_format_gives_the_same_pairs(
 
 
 def test_csv_with_leaders_gives_lengths(kinds: Path) -> None:
-    pairs = SumoFcdDataset(path=kinds / "leaders.csv", min_frames=2).load()
+    pairs = SumoFcdDataset(path=kinds / "leaders.csv", min_duration=0).load()
     lengths = {pair.leader_driver_type: pair.leader_length for pair in pairs}
     assert lengths == {"car": 4.3, "truck": 12.0}
 
@@ -350,9 +350,9 @@ def test_rows_of_persons_and_empty_steps_are_no_vehicles(tmp_path: Path) -> None
         rows.append(f"{frame};b;car;10;{80 + 10 * frame};e_0")
         rows.append(f"{frame};walker;DEFAULT_PEDTYPE;1;{frame};")
     path.write_text("\n".join(rows) + "\n")
-    pairs = SumoFcdDataset(path=path, min_frames=2).read()
+    pairs = SumoFcdDataset(path=path, min_duration=0).read()
     assert [(pair.leader_id, pair.follower_id, len(pair)) for pair in pairs] == [("a", "b", 5)]
     assert ("a person, or in no lane", 5) in [(drop.reason, drop.count) for drop in pairs.dropped]
     path.write_text(path.read_text().replace("1;a;car;10;", "1;a;car;;"))
     with pytest.raises(DataError, match=r"row 3, column speed .*a vehicle in a lane has a speed"):
-        SumoFcdDataset(path=path, min_frames=2).read()
+        SumoFcdDataset(path=path, min_duration=0).read()

@@ -15,7 +15,7 @@ from cfx.data.tidy import write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
 
 QUICK = [
-    "data.min_frames=100",
+    "data.min_duration=10",
     "optimizer=random",
     "optimizer.samples=16",
     "calibration.prior=none",
@@ -28,7 +28,7 @@ QUICK = [
 def pairs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "pairs.parquet"
-    write_tidy(SyntheticDataset(pairs=4, frames=300, min_frames=100).load(), path)
+    write_tidy(SyntheticDataset(pairs=4, frames=300, min_duration=10).load(), path)
     return path
 
 

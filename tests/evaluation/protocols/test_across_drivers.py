@@ -151,7 +151,7 @@ def test_short_pairs_of_a_tested_recording_are_learned_from_elsewhere_only() -> 
         for k, pair in enumerate(short)
     ]
     fold = (
-        AcrossDrivers(folds=2, together="recording", min_test_frames=100)
+        AcrossDrivers(folds=2, together="recording", min_test_duration=10)
         .folds(PairSet((*long, *shorter), "test"), seed=0)
         .tolist()
     )
@@ -323,7 +323,7 @@ def test_short_pairs_are_learned_from_but_not_tested() -> None:
         replace(extra[1], pair_id="s1", leader_id="78", follower_id="500"),
     )
     pairs = PairSet((*long.pairs, *short), "test")
-    protocol = AcrossDrivers(min_test_frames=100)
+    protocol = AcrossDrivers(min_test_duration=10)
     fold = protocol.folds(pairs, seed=0)
     assert fold[:10].equal(AcrossDrivers().folds(long, seed=0))
     assert int(fold[10]) == -2 - int(fold[3])
@@ -332,9 +332,9 @@ def test_short_pairs_are_learned_from_but_not_tested() -> None:
 
 def test_too_few_long_pairs_are_refused() -> None:
     with pytest.raises(
-        DataError, match=r"has only 0 drivers.*lower protocol\.min_test_frames=5000 or"
+        DataError, match=r"has only 0 drivers.*lower protocol\.min_test_duration=500 or"
     ):
-        AcrossDrivers(min_test_frames=5000).folds(chained(("1", "2"), ("2", "3")), seed=0)
+        AcrossDrivers(min_test_duration=500).folds(chained(("1", "2"), ("2", "3")), seed=0)
 
 
 def rollout(folder: Path, *changes: str) -> cfx.JobResult:
@@ -537,8 +537,8 @@ def test_trajectories_that_are_too_short_to_test_change_what_is_learned(tmp_path
     options = [
         "data=tidy",
         f"data.path={tmp_path / 'pairs.csv'}",
-        "protocol.min_test_frames=180",
-        "data.min_frames=100",
+        "protocol.min_test_duration=18",
+        "data.min_duration=10",
     ]
     options.append("data.max_pairs=null")
     data = [option for option in QUICK if not option.startswith("data.")]

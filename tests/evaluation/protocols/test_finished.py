@@ -92,8 +92,8 @@ def test_who_was_learned_from_is_refused_and_who_is_too_short_is_left_out(
     seen = ["data.seed=5", "data.pairs=6", "data.max_pairs=3"]
     with pytest.raises(DataError, match="has learned from 3 of the 3 pairs"):
         job(FORECAST, drawn, tmp_path / "seen", *seen)
-    with pytest.raises(CfxError, match=r"no pair in .* has protocol.min_test_frames=201 frames"):
-        job(FORECAST, drawn, tmp_path / "long", "protocol.min_test_frames=201")
+    with pytest.raises(CfxError, match=r"no pair in .* lasts protocol.min_test_duration=20.1 s"):
+        job(FORECAST, drawn, tmp_path / "long", "protocol.min_test_duration=20.1")
     with pytest.raises(DataError, match=r"protocol\.run=.*nowhere/policy holds no policy"):
         job(FORECAST, tmp_path / "nowhere", tmp_path / "job")
 

@@ -177,7 +177,7 @@ def test_a_motorway_is_unlike_the_congestion_that_was_learned_from(shared_data: 
     agent = load(folder_of_ready_made("cfx://i80-idm-history") / "policy").for_unseen_drivers()
     unlike = {}
     for name in ("i80_reconstructed", "openacc_vicolungo"):
-        pairs = TidyDataset(path=str(shared_data / f"{name}_pairs.parquet"), min_frames=300).load()
+        pairs = TidyDataset(path=str(shared_data / f"{name}_pairs.parquet"), min_duration=30).load()
         batch = PairBatch.of(pairs)
         features = agent.driver_features_of(batch, (0.8 * batch.lengths).long())
         assert features is not None

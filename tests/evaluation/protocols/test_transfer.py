@@ -202,7 +202,7 @@ def test_what_it_has_learned_from_is_refused_whatever_it_is_called(
         replace(pair, recording="other", pair_id=f"x{pair.pair_id}", truth={}) for pair in seen[:4]
     )
     write_tidy(PairSet((*renamed, *elsewhere()), "both"), tmp_path / "renamed.csv")
-    again = TidyDataset(path=tmp_path / "renamed.csv", min_frames=100).load()
+    again = TidyDataset(path=tmp_path / "renamed.csv", min_duration=10).load()
     with pytest.raises(DataError, match="has learned from 4 of the 7 pairs"):
         Transfer(run=unseen).finished.check(again)
 
@@ -221,7 +221,7 @@ def test_other_units_and_fewer_decimals_do_not_hide_what_it_has_learned_from(
         path = tmp_path / f"{name}.csv"
         saved.to_csv(path, index=False)
         with pytest.raises(DataError, match="has learned from 6 of the 6 pairs"):
-            Transfer(run=unseen).finished.check(TidyDataset(path=path, min_frames=2).load())
+            Transfer(run=unseen).finished.check(TidyDataset(path=path, min_duration=0).load())
 
 
 def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_path: Path) -> None:

@@ -19,11 +19,11 @@ TESTED = 71
 
 OVERRIDES = (
     "data=tidy",
-    "data.min_frames=300",
+    "data.min_duration=30",
     "protocol=across_drivers",
     "protocol.folds=5",
     "protocol.together=driver",
-    "protocol.min_test_frames=700",
+    "protocol.min_test_duration=70",
     "protocol.base=population",
     "protocol.history=0.0",
     "protocol.histories=[]",

@@ -13,7 +13,7 @@ EVERY_ROAD = (
 )
 """Recordings, as they are called in the folder that `make policies` is given."""
 
-_LONG = ("data=tidy", "data.min_frames=300", "protocol.min_test_frames=700")
+_LONG = ("data=tidy", "data.min_duration=30", "protocol.min_test_duration=70")
 _I80 = ("optimizer=random", *_LONG)
 """I-80's policies start from constants that were found by random search."""
 

@@ -144,7 +144,7 @@ def _require_free(overrides: Sequence[str]) -> None:
 def _fingerprint(data: Path) -> str:
     """Returns the fingerprint of the pairs that the benchmark takes of a file."""
     cls = cfx.get("dataset", "tidy")
-    dataset = cast(cfx.Dataset, cls(path=data, min_frames=300))
+    dataset = cast(cfx.Dataset, cls(path=data, min_duration=30))
     return dataset.load().fingerprint
 
 
