@@ -25,25 +25,17 @@ pair all of whose signals are in feet is a pair of fast vehicles far apart
 
 from __future__ import annotations
 
-import logging
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from cfx.core.errors import DataError, listed
 from cfx.data.files import Floats
 from cfx.data.pairs import Pair, PairSet
-from cfx.data.plausible import doubts
 from cfx.data.tracks import beyond_rates, driven
 from cfx.data.units import factor
-
-log = logging.getLogger(__name__)
-
-Check = Literal["refuse", "report", "off"]
 
 _WINDOW_S = 5.0
 
@@ -52,9 +44,6 @@ _WINDOWS = 200
 
 _TELLING_FRAMES = 12
 """In fewer frames it matters whether a rate is that of the step before, behind or around."""
-
-_SHOWN = 3
-"""Pairs that a message names."""
 
 _SAME = 0.08
 """How far a measured factor may be from one that is known."""
@@ -631,69 +620,3 @@ def _median(values: Sequence[float]) -> tuple[float, float]:
     if len(values) < _MANY_PAIRS:
         return median, 2.0 * float(away.max())
     return median, 6.0 * float(np.median(away)) / math.sqrt(len(values))
-
-
-_NUMBERS = re.compile(r"[0-9.]+")
-
-
-def in_words(pairs: PairSet, units: Units | None = None) -> str:
-    """Returns which pairs contradict themselves, how and what to do; "" if none does.
-
-    Args:
-        pairs: in SI units.
-        units: those that their file is said to have in place of SI units.
-    """
-    found = list(contradictions(pairs, units))
-    if not found:
-        typical = typical_contradiction(pairs)
-        if typical is None:
-            return ""
-        return (
-            f"{pairs.source}: the {len(pairs)} pairs together contradict themselves:"
-            f" {typical.text(units)}"
-        )
-    count = f"{len(found)} of {len(pairs)} pairs contradict themselves"
-    if len(found) == 1:
-        count = f"one of {len(pairs)} pairs contradicts itself"
-    alike: dict[str, list[tuple[str, Contradiction]]] = {}
-    for one in found:
-        alike.setdefault(_NUMBERS.sub("", one[1].text(units)), []).append(one)
-    parts = []
-    for group in sorted(alike.values(), key=len, reverse=True)[:_SHOWN]:
-        names = listed([f"'{name}'" for name, _ in group], _SHOWN)
-        parts.append(f"{_common([how for _, how in group]).text(units)} (pairs: {names})")
-    return f"{pairs.source}: {count}: {'; '.join(parts)}"
-
-
-def _common(found: Sequence[Contradiction]) -> Contradiction:
-    """Returns the contradiction of the median slope, which stands for those of several pairs."""
-    return sorted(found, key=lambda one: one.slope or 0.0)[len(found) // 2]
-
-
-def check_kinematics(
-    pairs: PairSet, check: Check, units: Units | None = None, *, can_say_units: bool = False
-) -> None:
-    """Refuses or reports pairs that contradict themselves, as `data.check` says; warns of doubts.
-
-    Args:
-        units: those that the file is said to have in place of SI units.
-        can_say_units: settings can say others.
-
-    Raises:
-        DataError: `check` is `refuse`, and some do.
-    """
-    if check == "off":
-        return
-    words = in_words(pairs, units)
-    if not words:
-        for doubt in doubts(pairs):
-            log.warning("%s: %s", pairs.source, doubt)
-    elif check == "report":
-        log.warning("%s (data.check=report)", words)
-    else:
-        remedy = "correct the file"
-        if can_say_units:
-            remedy += ", say which units it has (data.columns and data.units)"
-        raise DataError(
-            f"{words}; {remedy}, leave these pairs out, or say data.check=report to go on"
-        )

@@ -34,6 +34,9 @@ _FROZEN_S = 1.0
 
 def doubts(pairs: PairSet) -> Iterator[str]:
     """Yields a sentence for each sign that signals are not what they are said to be."""
+    for remark in pairs.remarks:
+        if not remark.is_contradiction:
+            yield remark.text
     length = float(np.median([pair.leader_length for pair in pairs]))
     if length > _LONG_M:
         yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"

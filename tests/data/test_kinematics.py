@@ -11,19 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cfx.core.errors import DataError
-from cfx.data.base import Dataset
-from cfx.data.describe import describe
-from cfx.data.kinematics import (
-    check_kinematics,
-    contradiction,
-    contradictions,
-    in_words,
-    typical_contradiction,
-)
+from cfx.data.kinematics import contradiction, contradictions, typical_contradiction
 from cfx.data.pairs import SIGNALS, Pair, PairSet
 from cfx.data.plausible import doubts
-from cfx.data.tidy import TidyDataset, frame_of
+from cfx.data.tidy import TidyDataset
 from cfx.data.tracks import driven
 from cfx.models.krauss import Krauss
 from cfx_recordings.ngsim import NgsimDataset
@@ -167,49 +158,6 @@ def test_a_stationary_pair_says_nothing_and_is_let_through() -> None:
         follower_position=np.zeros(300),
     )
     assert contradiction(still) is None
-
-
-def test_a_job_is_refused_warned_or_left_alone(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    frame = frame_of(PAIRS)
-    chosen = frame["pair_id"] == PAIRS[2].pair_id
-    frame.loc[chosen, "follower_speed_mps"] *= 3.6
-    path = tmp_path / "pairs.csv"
-    frame.to_csv(path, index=False)
-
-    def dataset(**more: object) -> Dataset:
-        return TidyDataset(path=path, min_frames=100, **more)
-
-    with pytest.raises(DataError) as error:
-        dataset().load()
-    for words in (str(path), "one of 4 pairs", f"'{PAIRS[2].pair_id}'", "km/h", "data.check"):
-        assert words in str(error.value)
-    assert "km/h" in describe(path).text
-    assert len(dataset(check="off").load()) == 4
-    assert not caplog.records
-    assert len(dataset(check="report").load()) == 4
-    assert "km/h" in caplog.text
-    # Pairs that a job does not use do not stop it.
-    assert len(dataset(pair_ids=[PAIRS[0].pair_id]).load()) == 1
-
-
-def test_every_dataset_is_checked(tmp_path: Path) -> None:
-    class Theirs(Dataset):
-        def read(self) -> PairSet:
-            return PairSet((times(-1, *ACCELERATIONS),), "a plugin's")
-
-    with pytest.raises(DataError, match=r"a plugin's: one of 1 pairs.*sign is turned"):
-        Theirs(min_frames=2).load()
-
-
-def test_only_some_pairs_are_named_and_all_counted() -> None:
-    wrong = PairSet(tuple(times(3.6, *SPEEDS, pair=pair) for pair in PAIRS), "made up")
-    words = in_words(wrong)
-    assert "4 of 4 pairs contradict themselves" in words
-    assert "(4 in all)" in words
-    with pytest.raises(DataError):
-        check_kinematics(wrong, "refuse")
 
 
 SHARED = ROOT.parent / "shared" / "data"
