@@ -19,9 +19,9 @@ from cfx.core.component import Component, Distinct, Settings
 from cfx.core.errors import DataError, PluginError, listed, nearest
 from cfx.core.files import absolute
 from cfx.core.storage import is_url, local_copies
+from cfx.data.check import Check, check_pairs
 from cfx.data.files import FileStart, recording_of, stem
-from cfx.data.kinematics import Check, check_kinematics
-from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
+from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet, Remark
 from cfx.data.signals import Accelerations, resampled, scaled, with_usable_accelerations
 from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
 from cfx.data.tracks import summed
@@ -57,10 +57,12 @@ class DatasetSettings(Settings):
     """Settings that all datasets have: which pairs to select."""
 
     check: Check = Field(
-        "refuse",
+        "drop_few",
         description="pairs whose positions, speeds, accelerations and gaps contradict one another,"
-        " as with a wrong unit or time step: refuse: the job ends; report: a warning; off: not"
-        " checked",
+        " as with a wrong unit or time step: drop_few: they are left out if they are fewer than one"
+        " in twenty, else the job ends; drop: they are left out, however many; refuse: the job"
+        " ends; report: they are used, with a warning; off: not checked. A file whose columns"
+        " contradict one another as a whole ends the job but with report and off",
     )
     min_duration: float = Field(
         10.0,
@@ -262,12 +264,14 @@ class Dataset(Component):
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_duration), self.settings)
         used = tuple(recorded[pair.pair_id] for pair in selected.pairs)
-        check_kinematics(
+        verdict = check_pairs(
             replace(selected, pairs=used),
             self.settings.check,
             self.units(),
             can_say_units=hasattr(self.settings, "units"),
         )
+        kept = [pair.pair_id not in verdict.left_out for pair in selected.pairs]
+        selected = selected.select(kept, verdict.reason)
         if isinstance(self.settings, FileDatasetSettings):
             selected = with_usable_accelerations(selected, self.settings.accelerations)
         return scaled(selected, self.settings.scale)
@@ -311,12 +315,21 @@ def joined(files: Iterable[PairSet]) -> PairSet:
     pairs: list[Pair] = []
     dropped: list[Dropped] = []
     ends: list[Dropped] = []
+    remarks: list[Remark] = []
     for part in parts:
         pairs += part
         dropped += part.dropped
         ends += part.ends
+        for remark in part.remarks:
+            remarks.append(replace(remark, text=f"{part.source}: {remark.text}"))
     sources = listed([part.source for part in parts], 3)
-    return PairSet(tuple(pairs), f"{len(parts)} files ({sources})", summed(dropped), summed(ends))
+    return PairSet(
+        tuple(pairs),
+        f"{len(parts)} files ({sources})",
+        summed(dropped),
+        summed(ends),
+        tuple(remarks),
+    )
 
 
 def _at_site(part: PairSet) -> PairSet:

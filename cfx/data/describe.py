@@ -20,8 +20,8 @@ from cfx.core.errors import DataError, PluginError, listed
 from cfx.core.files import path_override
 from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset, rounded_down
+from cfx.data.check import Check, judge
 from cfx.data.files import Floats, beginning, partitions
-from cfx.data.kinematics import in_words
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.plausible import doubts, rare
 from cfx.data.signals import frames_in_steps
@@ -112,7 +112,7 @@ def describe(
     pieces += ["", f"Left out in reading:{'' if left_out else ' nothing'}", *left_out]
     if contents.pairs.ends:
         pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
-    problems = [*_suspicions(contents, dataset.units())]
+    problems = [*_suspicions(contents, dataset.settings.check, dataset.units())]
     if contents.problem:
         problems.append(contents.problem)
     pieces += ["", f"Problems:{'' if problems else ' none found'}"]
@@ -420,7 +420,7 @@ def _counts(counts: Sequence[Dropped]) -> list[str]:
     return [f"  {one.count:,} {one.unit}: {one.reason}" for one in counts]
 
 
-def _suspicions(contents: Contents, units: Mapping[str, str]) -> Iterator[str]:
+def _suspicions(contents: Contents, check: Check, units: Mapping[str, str]) -> Iterator[str]:
     """Yields a sentence for each kind of values that a recording rarely holds."""
     pairs = contents.pairs
     if not len(pairs):
@@ -437,8 +437,8 @@ def _suspicions(contents: Contents, units: Mapping[str, str]) -> Iterator[str]:
             f"{without} pairs have leaders of length 0: their gaps are bumper to bumper if"
             " leader positions are those of rear bumpers, and too long by a vehicle if not"
         )
-    words = in_words(pairs, units)
-    if words:
-        yield f"{words}; a job that uses them is refused (data.check)"
+    verdict = judge(pairs, check, units)
+    if verdict.words:
+        yield f"{verdict.words}; {verdict.consequence}"
     yield from doubts(pairs)
     yield from rare(pairs)

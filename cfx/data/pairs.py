@@ -229,17 +229,33 @@ class Dropped:
 
 
 @dataclass(frozen=True)
+class Remark:
+    """What reading has noticed about a source as a whole.
+
+    Attributes:
+        text: a sentence without a full stop, for people.
+        is_contradiction: the source contradicts itself, so that its pairs are not what they say;
+            `data.check` refuses it. Else it is a doubt, of which a job warns.
+    """
+
+    text: str
+    is_contradiction: bool = False
+
+
+@dataclass(frozen=True)
 class PairSet(Sequence[Pair]):
     """Pairs in a fixed order, where they came from, and a count of everything that was left out.
 
     Attributes:
         ends: why the pairs that were cut out of tracks end, counted over all that were found.
+        remarks: what was noticed about the source as a whole.
     """
 
     pairs: tuple[Pair, ...]
     source: str
     dropped: tuple[Dropped, ...] = ()
     ends: tuple[Dropped, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
     def __post_init__(self) -> None:
         seen: set[str] = set()

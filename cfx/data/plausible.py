@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cfx.data.pairs import Pair, PairSet, twins
 from cfx.data.style import STANDING_MPS
+from cfx.data.tracks import beyond_rates
 
 Marks = NDArray[np.bool_]
 
@@ -33,6 +34,9 @@ _FROZEN_S = 1.0
 
 def doubts(pairs: PairSet) -> Iterator[str]:
     """Yields a sentence for each sign that signals are not what they are said to be."""
+    for remark in pairs.remarks:
+        if not remark.is_contradiction:
+            yield remark.text
     length = float(np.median([pair.leader_length for pair in pairs]))
     if length > _LONG_M:
         yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
@@ -85,8 +89,7 @@ def _jumps(pair: Pair) -> Marks:
     jumps = np.zeros(len(pair) - 1, dtype=bool)
     for who in ("leader", "follower"):
         position, speed = getattr(pair, f"{who}_position"), getattr(pair, f"{who}_speed")
-        said = 0.5 * (speed[1:] + speed[:-1]) * pair.dt
-        jumps |= np.abs(np.diff(position) - said) > room
+        jumps |= np.abs(beyond_rates(position, speed, pair.dt)) > room
     return jumps
 
 

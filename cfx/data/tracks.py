@@ -349,3 +349,21 @@ def accelerations(speed: Floats, dt: float) -> Floats:
     """Returns how fast the speed changes, `(T,)`, m/s2: central differences, one-sided at ends."""
     change: NDArray[np.float64] = np.gradient(speed, dt)
     return change
+
+
+def beyond_rates(values: Floats, rates: Floats, dt: float) -> Floats:
+    """Returns how far each step of a signal goes beyond what its rates allow, `(T - 1,)`.
+
+    It is 0 where the signal changes as fast as its rate at either end of the step, or anything
+    between: whoever recorded it may have used the old rate, the new one or their mean.
+
+    Args:
+        values: the signal, `(T,)`.
+        rates: its rate, `(T,)`, per second.
+        dt: time step, s.
+    """
+    moved = np.diff(values)
+    least = np.minimum(rates[1:], rates[:-1]) * dt
+    most = np.maximum(rates[1:], rates[:-1]) * dt
+    beyond: Floats = moved - np.clip(moved, least, most)
+    return beyond

@@ -97,7 +97,7 @@ SPOILED: dict[str, tuple[pd.DataFrame, Change, str]] = {
     "by gap, mph": (BY_GAP, times(2.23694, *SPEEDS), "the speeds look like mph"),
     "by gap, leader in km/h": (BY_GAP, times(3.6, SPEEDS[0]), "the leader's speeds look like km/h"),
     "by gap, swapped": (BY_GAP, swapped(*SPEEDS), "look swapped"),
-    "by gap, wrong rate": (BY_GAP, times(25 / 30, "time_s"), "time step looks like 0.0999 s"),
+    "by gap, wrong rate": (BY_GAP, times(25 / 30, "time_s"), "time step looks like 0.1 s"),
 }
 
 

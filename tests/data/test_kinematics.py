@@ -11,18 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cfx.core.errors import DataError
-from cfx.data.base import Dataset
-from cfx.data.describe import describe
-from cfx.data.kinematics import (
-    check_kinematics,
-    contradiction,
-    contradictions,
-    in_words,
-    typical_contradiction,
-)
-from cfx.data.pairs import Pair, PairSet
-from cfx.data.tidy import TidyDataset, frame_of
+from cfx.data.kinematics import contradiction, contradictions, typical_contradiction
+from cfx.data.pairs import SIGNALS, Pair, PairSet
+from cfx.data.plausible import doubts
+from cfx.data.tidy import TidyDataset
 from cfx.data.tracks import driven
 from cfx.models.krauss import Krauss
 from cfx_recordings.ngsim import NgsimDataset
@@ -113,6 +105,52 @@ def test_a_few_coarse_frames_say_nothing() -> None:
     assert contradiction(replace(coarse, dt=1.0, leader_position=position, **signals)) is None
 
 
+def coarse_pair(rule: float, step: float = 1.0) -> Pair:
+    """Returns a lively pair whose vehicles move by the new speed (1), its mean (0), the old (-1).
+
+    Accelerations are those of the last step, as simulators write them.
+    """
+    generator = np.random.default_rng(5)
+    (pair,) = straight_pairs([200]).pairs
+    signals: dict[str, np.ndarray] = {}
+    for who, ahead, late in (("leader", 60.0, 0), ("follower", 0.0, 2)):
+        speed = 12.0 + np.sin(0.3 * (np.arange(200) - late)) + generator.uniform(-2, 2, 200)
+        moved = 0.5 * (speed[1:] + speed[:-1]) + 0.5 * rule * np.diff(speed)
+        signals[f"{who}_position"] = ahead + np.append(0.0, np.cumsum(moved * step))
+        signals[f"{who}_speed"] = speed
+        signals[f"{who}_acceleration"] = np.append(0.0, np.diff(speed) / step)
+    return replace(pair, dt=step, **signals)
+
+
+@pytest.mark.parametrize("rule", [1.0, 0.0, -1.0])
+def test_a_source_may_integrate_by_a_rule_of_its_own(rule: float) -> None:
+    pair = coarse_pair(rule)
+    assert contradiction(pair) is None
+    assert not [words for words in doubts(PairSet((pair,), "made up")) if "steps" in words]
+    wrong = contradiction(times(3.6, "follower_speed", pair=pair))
+    assert wrong is not None
+    assert "km/h" in wrong.text()
+
+
+def test_noise_between_coarse_frames_is_not_held_against_a_signal() -> None:
+    """Accelerations that are differences of noisy speeds at 10 Hz, of which every tenth is kept."""
+    generator = np.random.default_rng(7)
+    time = np.arange(3000) * 0.1
+    (pair,) = straight_pairs([300]).pairs
+    signals = {}
+    for who, late in (("leader", 0.0), ("follower", 1.0)):
+        speed = 12.0 + 1.5 * np.sin(0.25 * (time - late)) + generator.normal(0, 0.06, len(time))
+        position = 40.0 - 40.0 * late + np.cumsum(speed) * 0.1
+        signals[f"{who}_speed"] = speed[::10]
+        signals[f"{who}_acceleration"] = np.gradient(speed, 0.1)[::10]
+        signals[f"{who}_position"] = position[::10]
+    pair = replace(pair, dt=1.0, **signals)
+    assert contradiction(pair) is None
+    wrong = contradiction(times(-1, *ACCELERATIONS, pair=pair))
+    assert wrong is not None
+    assert "sign is turned" in wrong.text()
+
+
 def test_a_stationary_pair_says_nothing_and_is_let_through() -> None:
     still = replace(
         times(0.0, *SPEEDS, *ACCELERATIONS),
@@ -122,58 +160,29 @@ def test_a_stationary_pair_says_nothing_and_is_let_through() -> None:
     assert contradiction(still) is None
 
 
-def test_a_job_is_refused_warned_or_left_alone(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    frame = frame_of(PAIRS)
-    chosen = frame["pair_id"] == PAIRS[2].pair_id
-    frame.loc[chosen, "follower_speed_mps"] *= 3.6
-    path = tmp_path / "pairs.csv"
-    frame.to_csv(path, index=False)
-
-    def dataset(**more: object) -> Dataset:
-        return TidyDataset(path=path, min_duration=10, **more)
-
-    with pytest.raises(DataError) as error:
-        dataset().load()
-    for words in (str(path), "one of 4 pairs", f"'{PAIRS[2].pair_id}'", "km/h", "data.check"):
-        assert words in str(error.value)
-    assert "km/h" in describe(path).text
-    assert len(dataset(check="off").load()) == 4
-    assert not caplog.records
-    assert len(dataset(check="report").load()) == 4
-    assert "km/h" in caplog.text
-    # Pairs that a job does not use do not stop it.
-    assert len(dataset(pair_ids=[PAIRS[0].pair_id]).load()) == 1
-
-
-def test_every_dataset_is_checked(tmp_path: Path) -> None:
-    class Theirs(Dataset):
-        def read(self) -> PairSet:
-            return PairSet((times(-1, *ACCELERATIONS),), "a plugin's")
-
-    with pytest.raises(DataError, match=r"a plugin's: one of 1 pairs.*sign is turned"):
-        Theirs(min_duration=0).load()
-
-
-def test_only_some_pairs_are_named_and_all_counted() -> None:
-    wrong = PairSet(tuple(times(3.6, *SPEEDS, pair=pair) for pair in PAIRS), "made up")
-    words = in_words(wrong)
-    assert "4 of 4 pairs contradict themselves" in words
-    assert "(4 in all)" in words
-    with pytest.raises(DataError):
-        check_kinematics(wrong, "refuse")
-
-
 SHARED = ROOT.parent / "shared" / "data"
+THINNED = ("i80_0400_raw_sample.csv.gz", "openacc_ispra_low_speed_pairs.parquet")
+"""Recordings with the noisiest accelerations: they are kept by half seconds and seconds, too."""
+
+
+def every(step: int, pair: Pair) -> Pair:
+    """Returns a pair of which every so many frames are kept."""
+    signals = {name: getattr(pair, name)[::step] for name in SIGNALS}
+    return replace(pair, dt=pair.dt * step, **signals)
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")
 @pytest.mark.parametrize("path", sorted(SHARED.glob("*.[pc]*")), ids=lambda path: path.name)
 def test_real_recordings_are_let_through(path: Path) -> None:
     kind = TidyDataset if path.suffix == ".parquet" else NgsimDataset
-    dataset = kind(path=path, min_duration=0, check="off", accelerations="recorded")
-    assert not list(contradictions(dataset.load()))
+    dataset = kind(path=path, min_duration=2, check="off", accelerations="recorded")
+    pairs = dataset.load()
+    assert not list(contradictions(pairs))
+    if path.name in THINNED:
+        for step in (5, 10):
+            thinned = pairs.changed(lambda pair, step=step: every(step, pair))
+            assert not list(contradictions(thinned))
+            assert typical_contradiction(thinned) is None
 
 
 @pytest.mark.skipif(not SHARED.is_dir(), reason="the real recordings are not here")

@@ -16,6 +16,7 @@ from cfx.app.cli import main
 from cfx.core.errors import DataError
 from cfx_contracts import check_contract
 from cfx_sumo.fcd import SumoFcdDataset
+from cfx_sumo.fcd_lanes import Lanes
 from tests.data.layouts import made_pairs, write_fcd
 
 
@@ -121,6 +122,28 @@ def test_reads_what_sumo_writes(of_sumo: Path) -> None:
         moved = np.diff(pair.follower_position)
         # Gaps and speeds are SUMO's own; they belong together to the digits that it writes.
         np.testing.assert_allclose(moved, pair.follower_speed[1:] * pair.dt, atol=1e-5)
+
+
+@pytest.mark.parametrize("rule", ["euler", "ballistic"])
+def test_positions_follow_speeds_as_sumo_integrates(rule: str) -> None:
+    """Over an edge's end too, where positions within lanes do not say it."""
+    speed = np.array([10.0, 12.0, 15.0, 14.0, 11.0, 11.0])
+    moved = speed[1:] if rule == "euler" else 0.5 * (speed[1:] + speed[:-1])
+    way = np.append(0.0, np.cumsum(moved))
+    lane = np.array([0, 0, 0, 1, 1, 1])
+    unknown = np.full(6, np.nan)
+    lanes = Lanes(
+        vehicle=np.ones(6, dtype=np.int64),
+        frame=np.arange(6),
+        lane=lane,
+        position=way - 30.0 * lane,
+        speed=speed,
+        lateral=unknown,
+        x=unknown,
+        y=unknown,
+        heading=unknown,
+    )
+    np.testing.assert_allclose(lanes.driven(1.0), way)
 
 
 def test_leaders_are_those_that_sumo_names(
