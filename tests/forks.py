@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 
 _SERVER = """
 import gc, json, os, runpy, sys

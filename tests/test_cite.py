@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from cfx.app import cli, nodes
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 
 
 def test_cite_prints_bibtex_with_the_version(capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,7 +22,7 @@ from cfx.core.errors import CfxError, ConfigError, DataError
 from cfx.data.tidy import write_tidy
 from cfx.results.mlflow import serve
 from cfx.results.mlflow.store import open_store
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 from tests.drives import straight_pairs
 
 JOB = """

@@ -21,7 +21,7 @@ from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import simulate
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx_contracts import contract_for
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 from tests.drives import straight_pairs
 from tests.printed import Reader, all_blocks, blocks
 from tests.test_imports import FLOORS

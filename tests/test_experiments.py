@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import cfx
 from cfx.app import cli, hydra_source, nodes
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 
 FOLDER = nodes.conf_dir() / "experiment"
 FOLDERS = [FOLDER, *sorted(ROOT.glob("plugins/*/cfx_*/conf/experiment"))]

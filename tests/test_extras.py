@@ -12,7 +12,7 @@ from cfx.app.nodes import distributions_text
 from cfx.app.user_errors import explain, no_command
 from cfx.core import distributions, registry
 from cfx.core.errors import PluginError
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 
 
 def test_the_file_holds_what_the_plugins_here_bring() -> None:

@@ -11,7 +11,7 @@ import cfx
 from cfx.data.tidy import frame_of, write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx_sumo.drive.scenarios import SCENARIOS
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 from tests.printed import Reader, all_blocks
 
 PAGES = sorted(path.stem for path in (ROOT / "docs" / "how-to").glob("*.md"))

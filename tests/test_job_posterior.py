@@ -12,7 +12,7 @@ import cfx
 from cfx.core.errors import ConfigError, PluginError
 from cfx.models.krauss import Krauss
 from cfx.results.tables import KnownParameters
-from tests.conftest import Installer
+from tests.installer import Installer
 
 QUICK = [
     "debug=quick",

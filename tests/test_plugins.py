@@ -19,7 +19,8 @@ from cfx.core import registry
 from cfx.core.errors import ConfigError, OutputError, PluginError
 from cfx_contracts.new import create
 from tests.broken_plugins import BROKEN, QUICK, Broken
-from tests.conftest import ROOT, Installer
+from tests.checkout import ROOT
+from tests.installer import Installer
 
 MODEL = """
     from cfx import DrivingModel, Parameter, ParameterSpace

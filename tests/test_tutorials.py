@@ -11,7 +11,7 @@ from types import ModuleType
 
 import pytest
 
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 from tests.printed import blocks
 
 FOLDER = ROOT / "docs" / "tutorials"

@@ -12,8 +12,8 @@ from cfx.data.describe import describe
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
-from tests.conftest import Installer
 from tests.drives import straight_pairs
+from tests.installer import Installer
 
 
 def test_describes_real_tidy_pairs(shared_data: Path) -> None:

@@ -18,7 +18,7 @@ from cfx.data.tidy import TidyDataset
 from cfx.data.tracks import driven
 from cfx.models.krauss import Krauss
 from cfx_recordings.ngsim import NgsimDataset
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 from tests.drives import straight_pairs, wavy_pairs
 
 TRUE = torch.tensor([[1.0, 0.1], [2.0, 0.4], [3.0, 0.8], [1.5, 0.2]], dtype=torch.float64)

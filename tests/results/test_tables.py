@@ -20,7 +20,7 @@ from cfx.results.table import (
     read_tables,
 )
 from cfx.results.tables import History
-from tests.conftest import ROOT
+from tests.checkout import ROOT
 from tests.made_up import GAINS, make_history, make_results
 from tests.test_job_results import findings as found
 

@@ -1,27 +1,12 @@
-"""Fixtures that cfx's own tests have too: real recordings, a browser."""
+"""Processes in which SUMO runs."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-pytest.register_assert_rewrite("tests.browser")
-
-from tests.browser import browser  # noqa: E402 - pytest rewrites its assertions first
-from tests.forks import Forks  # noqa: E402
-
-__all__ = ["browser"]
-
-
-@pytest.fixture(scope="session")
-def shared_data() -> Path:
-    """The folder with real recordings; skips where it is absent."""
-    folder = Path(__file__).resolve().parents[4] / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip(f"real recordings are not here ({folder}); see CONTRIBUTING.md")
-    return folder
+from tests.forks import Forks
 
 
 @pytest.fixture(scope="session")

@@ -12,7 +12,7 @@ import pytest
 from cfx.app import cli
 from cfx.core import registry
 from cfx.core.distributions import OWN
-from tests.conftest import Installer
+from tests.installer import Installer
 
 OWN = [one.name for one in registry.entries("command") if one.distribution == OWN]
 

@@ -19,7 +19,7 @@ from cfx.app.sweep.summary import metric_columns, rows, summary_table, write_sum
 from cfx.core.errors import PluginError
 from cfx.evaluation.metrics.base import ALWAYS, MetricSet
 from tests.broken_plugins import QUICK
-from tests.conftest import Installer
+from tests.installer import Installer
 
 GOOD = """
 from cfx import Metric

@@ -18,7 +18,7 @@ from cfx.figures.figure import JobFigure, Results, draw, write_figure, write_fig
 from cfx_report.inline import PLACE, inline_svg
 from cfx_report.page import render
 from cfx_report.runs import read_runs
-from tests.conftest import Installer
+from tests.installer import Installer
 from tests.made_up import (
     GAINS,
     make_distributions,
