@@ -3,7 +3,7 @@
     result = cfx.run(["data=tidy", "data.path=pairs.parquet", "model=w99", "policy=gru"])
     result.metrics["rmse_improvement/mean"]
 
-The names below, `cfx.core.errors` and `cfx_contracts` are the public API; everything else may
+The names below, `cfx.errors` and `cfx_contracts` are the public API; everything else may
 change. Importing cfx imports nothing heavy: each name is loaded when it is first used.
 """
 
@@ -143,7 +143,7 @@ def __getattr__(name: str) -> Any:
     if name in _HOMES:
         value = getattr(import_module(_HOMES[name]), name)
     elif name == "errors":
-        value = import_module("cfx.core.errors")
+        value = import_module("cfx.errors")
     elif name == "__version__":
         value = _version()
     else:

@@ -19,8 +19,8 @@ from cfx.api.experiment import config
 from cfx.api.pairs import Pairs, read
 from cfx.app.job import steps
 from cfx.calibration.identifiability import losses_of
-from cfx.core.errors import DataError
 from cfx.core.guest import visit
+from cfx.errors import DataError
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.simulation.windows import Split
 

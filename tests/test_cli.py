@@ -18,8 +18,8 @@ from hydra.core.hydra_config import HydraConfig
 import cfx
 from cfx.app import application, cli
 from cfx.core import registry
-from cfx.core.errors import CfxError, ConfigError, DataError
 from cfx.data.tidy import write_tidy
+from cfx.errors import CfxError, ConfigError, DataError
 from cfx.results.mlflow import serve
 from cfx.results.mlflow.store import open_store
 from tests.checkout import ROOT
@@ -28,7 +28,7 @@ from tests.drives import straight_pairs
 JOB = """
     import logging, os, signal, sys, time
     from dataclasses import dataclass
-    from cfx.core.errors import DataError
+    from cfx.errors import DataError
 
     log = logging.getLogger("cfx.jobs_stub")
 

@@ -16,8 +16,8 @@ from pydantic import Field, ValidationError
 from cfx import DrivingModel, Parameter, ParameterSpace, Settings
 from cfx.app import hydra_source, nodes
 from cfx.core import registry
-from cfx.core.errors import ConfigError, PluginError
 from cfx.core.files import path_override
+from cfx.errors import ConfigError, PluginError
 from cfx.results.config import JobConfig
 
 CONF = nodes.conf_dir()

@@ -7,7 +7,7 @@ import logging
 import pytest
 
 from cfx.core.console import ConsoleHandler
-from cfx.core.errors import DataError, printable, without_passwords
+from cfx.errors import DataError, printable, without_passwords
 
 
 def test_names_cannot_command_a_terminal() -> None:

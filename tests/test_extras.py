@@ -11,7 +11,7 @@ from hydra.errors import MissingConfigException
 from cfx.app.nodes import distributions_text
 from cfx.app.user_errors import explain, no_command
 from cfx.core import distributions, registry
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 from tests.checkout import ROOT
 
 

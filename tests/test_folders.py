@@ -13,8 +13,8 @@ import yaml
 
 from cfx.app import cli
 from cfx.app.job import results
-from cfx.core.errors import CfxError
 from cfx.core.files import atomic_write, remove_leftovers
+from cfx.errors import CfxError
 from cfx.evaluation.protocols.within_driver import WithinDriver
 from tests.broken_plugins import QUICK
 

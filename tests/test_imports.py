@@ -176,7 +176,7 @@ def test_a_wrong_path_is_answered_before_anything_heavy_is_imported(tmp_path: Pa
     script = f"""
         import sys
         import cfx.data.describe, cfx.simulation.synthetic
-        from cfx.core.errors import DataError
+        from cfx.errors import DataError
         from cfx.results.config import JobConfig
         from cfx.app.job.run import run_job
         from pathlib import Path

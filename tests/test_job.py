@@ -19,9 +19,9 @@ import cfx
 from cfx.app import cli
 from cfx.app.job import steps
 from cfx.core import registry
-from cfx.core.errors import DataError
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import write_tidy
+from cfx.errors import DataError
 from cfx.simulation.synthetic import SyntheticDataset
 
 QUICK = [

@@ -9,7 +9,7 @@ import pytest
 from rich.text import Text
 
 import cfx
-from cfx.core.errors import ConfigError, PluginError
+from cfx.errors import ConfigError, PluginError
 from cfx.models.krauss import Krauss
 from cfx.results.tables import KnownParameters
 from tests.installer import Installer

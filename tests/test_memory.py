@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from cfx.app import cli
-from cfx.core.errors import ConfigError
 from cfx.core.memory import in_units, is_out_of_memory, require_memory
+from cfx.errors import ConfigError
 from cfx.evaluation.protocols.within_driver import WithinDriver
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.synthetic import SyntheticDataset

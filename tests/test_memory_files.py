@@ -16,12 +16,12 @@ import torch
 
 import cfx
 from cfx.core import memory
-from cfx.core.errors import OutputError
 from cfx.data import style, tidy
 from cfx.data.base import joined
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.signals import resampled, scaled
 from cfx.data.tidy import read_tidy, write_tidy
+from cfx.errors import OutputError
 from cfx.evaluation import closed_loop, evaluate, result
 from cfx.simulation.synthetic import SyntheticDataset
 

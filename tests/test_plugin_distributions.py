@@ -111,7 +111,7 @@ CONTRACTS = {
 }
 """What cfx-contracts tries components with; no other plugin uses these."""
 
-PUBLIC_MODULES = {"cfx", "cfx.core.errors", *READERS, *FIGURES, *RESULTS, *PROTOCOLS, *POLICIES} | {
+PUBLIC_MODULES = {"cfx", "cfx.errors", *READERS, *FIGURES, *RESULTS, *PROTOCOLS, *POLICIES} | {
     kind.base.partition(":")[0] for kind in registry.KINDS.values()
 }
 """What a plugin may import from; docs/plugins.md says so."""

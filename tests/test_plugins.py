@@ -16,7 +16,7 @@ import pytest
 import cfx
 from cfx.app import application, cli
 from cfx.core import registry
-from cfx.core.errors import ConfigError, OutputError, PluginError
+from cfx.errors import ConfigError, OutputError, PluginError
 from cfx_contracts.new import create
 from tests.broken_plugins import BROKEN, QUICK, Broken
 from tests.checkout import ROOT

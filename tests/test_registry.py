@@ -8,7 +8,7 @@ import sys
 import pytest
 
 from cfx.core import registry
-from cfx.core.errors import ConfigError, ParameterError, PluginError
+from cfx.errors import ConfigError, ParameterError, PluginError
 
 MODEL = '''
     """A third party's model."""

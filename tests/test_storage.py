@@ -17,9 +17,9 @@ from cfx.app.sweep.folder import fingerprint
 from cfx.calibration.cache import Cache
 from cfx.core import registry, storage
 from cfx.core.distributions import install_line
-from cfx.core.errors import CfxError, DataError, OutputError
 from cfx.core.storage import RemoteFolder, is_url, local_copies, state
 from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.errors import CfxError, DataError, OutputError
 from cfx.results.config import JobConfig
 from cfx_report.runs import read_runs
 from tests.broken_plugins import QUICK

@@ -30,7 +30,7 @@ JOB = """
     import json, os, time
     from dataclasses import dataclass
     from pathlib import Path
-    from cfx.core.errors import DataError
+    from cfx.errors import DataError
 
     @dataclass
     class Result:
@@ -549,7 +549,7 @@ def statuses(folder: Path) -> list[str]:
 SEARCH = """
     from hydra.core.plugins import Plugins
     from hydra.plugins.sweeper import Sweeper
-    from cfx.core.errors import CfxError
+    from cfx.errors import CfxError
 
     class Search(Sweeper):
         told = []

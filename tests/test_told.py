@@ -13,10 +13,10 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import cfx
 from cfx.app import cli
-from cfx.core.errors import DataError
 from cfx.data.describe import describe
-from cfx.data.table import Column, Layout, read_table
+from cfx.data.table import FileColumn, Layout, read_table
 from cfx.data.tidy import frame_of, read_tidy
+from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from tests.drives import wavy_pairs
 from tests.scripts import ENVIRONMENT, command_of
@@ -66,7 +66,7 @@ def test_missing_columns_say_what_gap_m_spares(tmp_path: Path) -> None:
 def test_rows_may_end_in_a_comma(tmp_path: Path, rows: str) -> None:
     path = tmp_path / "table.csv"
     path.write_text("a,b\n" + rows)
-    table = read_table(path, Layout(name="two", columns=(Column("a"), Column("b"))))
+    table = read_table(path, Layout(name="two", columns=(FileColumn("a"), FileColumn("b"))))
     assert pd.DataFrame(table.numbers)[["a", "b"]].to_numpy().tolist() == [[1, 2], [3, 4]]
 
 
@@ -82,7 +82,7 @@ def test_more_than_a_comma_is_still_refused(tmp_path: Path, rows: str, says: str
     path = tmp_path / "table.csv"
     path.write_text("a,b\n" + rows)
     with pytest.raises(DataError, match=says):
-        read_table(path, Layout(name="two", columns=(Column("a"), Column("b"))))
+        read_table(path, Layout(name="two", columns=(FileColumn("a"), FileColumn("b"))))
 
 
 @pytest.mark.slow
@@ -91,7 +91,7 @@ def test_a_program_that_was_told_of_a_bad_row_ends(tmp_path: Path) -> None:
     (tmp_path / "table.csv").write_text("a,b\n" + 1000 * "1,2\n" + "3,4,5\n")
     text = f"""
 from pathlib import Path
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx.data.table import Column, Layout, read_table
 try:
     read_table(Path({str(tmp_path / "table.csv")!r}), Layout(name="two", columns=(Column("a"),)))

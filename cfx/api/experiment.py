@@ -15,8 +15,8 @@ from cfx.app.job.results import JobResult, read_config
 from cfx.app.job.run import compute
 from cfx.app.overrides import IN_MEMORY, command_of, config_of
 from cfx.core import registry
-from cfx.core.errors import ConfigError
 from cfx.core.guest import visit
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
@@ -212,7 +212,7 @@ def in_folder(policy: PolicyLike) -> Iterator[str]:
     agent = policy.policy if isinstance(policy, JobResult) else policy
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary, IN_MEMORY)
-        checkpoint.save(agent, folder / "policy")
+        checkpoint.save_agent(agent, folder / "policy")
         yield str(folder)
 
 

@@ -15,8 +15,8 @@ import pandas as pd
 
 from cfx.api.experiment import Experiment, config
 from cfx.api.pairs import Pairs, PairsLike, pairs_from
-from cfx.core.errors import ConfigError
 from cfx.core.guest import visit
+from cfx.errors import ConfigError
 
 if TYPE_CHECKING:
     import torch

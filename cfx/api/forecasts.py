@@ -14,8 +14,8 @@ import pandas as pd
 
 from cfx.api.experiment import PolicyLike, config, in_folder, settings_of
 from cfx.api.pairs import PairsLike, pairs_from
-from cfx.core.errors import ConfigError
 from cfx.core.guest import visit
+from cfx.errors import ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

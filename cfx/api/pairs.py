@@ -15,7 +15,6 @@ import pyarrow as pa
 from cfx.app.overrides import IN_MEMORY, config_of
 from cfx.core import registry
 from cfx.core.component import validate
-from cfx.core.errors import ConfigError, DataError
 from cfx.core.files import absolute
 from cfx.core.guest import guest
 from cfx.core.storage import is_url
@@ -23,6 +22,7 @@ from cfx.data.base import Dataset
 from cfx.data.describe import dataset_of
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, TidySettings, frame_of, pairs_from_frame, write_tidy
+from cfx.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -17,11 +17,11 @@ from cfx.api.fit import Fit
 from cfx.api.pairs import PairsLike, pairs_from
 from cfx.app.overrides import config_of
 from cfx.core import registry
-from cfx.core.errors import ConfigError, DataError
 from cfx.core.guest import visit
 from cfx.data.pairs import Pair, PairBatch, PairSet
-from cfx.data.table import Column, Layout, table_of
+from cfx.data.table import FileColumn, Layout, table_of
 from cfx.data.tracks import accelerations, driven
+from cfx.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -38,8 +38,8 @@ _FASTEST_MPS, _LONGEST_STEP_S = 100.0, 2.0
 _LEADER = Layout(
     "a leader's speed over time",
     (
-        Column("time_s", "s"),
-        Column("speed", "m/s", least=0.0, wrong="is no speed; give 0 or more, in m/s"),
+        FileColumn("time_s", "s"),
+        FileColumn("speed", "m/s", least=0.0, wrong="is no speed; give 0 or more, in m/s"),
     ),
 )
 

@@ -40,7 +40,12 @@ from cfx.app.sweep.folder import (
 )
 from cfx.app.user_errors import explain, explained, is_user_error
 from cfx.core.console import console_logging
-from cfx.core.errors import (
+from cfx.core.guest import guest, visit
+from cfx.core.memory import is_out_of_memory
+from cfx.core.processes import raise_if_signalled, signal_behind, terminable
+from cfx.core.registry import blame
+from cfx.core.storage import is_url
+from cfx.errors import (
     CfxError,
     ConfigError,
     JobFailedError,
@@ -49,11 +54,6 @@ from cfx.core.errors import (
     printable,
     without_passwords,
 )
-from cfx.core.guest import guest, visit
-from cfx.core.memory import is_out_of_memory
-from cfx.core.processes import raise_if_signalled, signal_behind, terminable
-from cfx.core.registry import blame
-from cfx.core.storage import is_url
 
 if TYPE_CHECKING:
     from cfx.app.job.results import JobResult

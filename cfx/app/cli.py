@@ -15,8 +15,8 @@ import traceback
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, NoReturn, cast
 
-from cfx.core.errors import CfxError, ConfigError, Terminated
 from cfx.core.processes import ignore_signals, raise_if_signalled, signal_behind, terminable
+from cfx.errors import CfxError, ConfigError, Terminated
 
 if TYPE_CHECKING:
     from cfx.core.command import Command

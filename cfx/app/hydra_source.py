@@ -34,7 +34,7 @@ from omegaconf import DictConfig, OmegaConf
 from cfx.app import nodes
 from cfx.core import registry
 from cfx.core.distributions import OWN
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 
 if TYPE_CHECKING:
     from cfx.core.command import Command

@@ -25,8 +25,8 @@ import cfx
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.distributions import FILE, OWN, options_of_checkout
-from cfx.core.errors import CfxError
 from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.errors import CfxError
 
 _WIDTH = 100
 """Longest line with a comment behind its value; a longer comment goes above."""

@@ -11,8 +11,8 @@ from typing import Any
 from cfx.app import hydra_source
 from cfx.app.user_errors import explained
 from cfx.core import registry
-from cfx.core.errors import DataError
 from cfx.core.files import quoted
+from cfx.errors import DataError
 from cfx.results.config import JobConfig
 
 

@@ -17,7 +17,7 @@ from omegaconf.errors import OmegaConfBaseException
 from cfx.app import hydra_source
 from cfx.core import registry
 from cfx.core.distributions import advice, brought
-from cfx.core.errors import CfxError, ConfigError, listed, nearest
+from cfx.errors import CfxError, ConfigError, listed, nearest
 
 
 def is_user_error(error: BaseException) -> bool:

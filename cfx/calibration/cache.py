@@ -26,9 +26,9 @@ import numpy as np
 from filelock import Timeout
 from numpy.typing import NDArray
 
-from cfx.core.errors import OutputError
 from cfx.core.files import atomic_write, lock_for
 from cfx.core.storage import RemoteFolder
+from cfx.errors import OutputError
 
 log = logging.getLogger(__name__)
 

@@ -19,9 +19,9 @@ from torch import Tensor
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import ConfigError, PluginError
 from cfx.core.memory import require_memory
 from cfx.core.threads import cores, share
+from cfx.errors import ConfigError, PluginError
 
 Progress = Callable[[int], None]
 """Called with how many more evaluations are done; they sum to problems times evaluations."""

@@ -23,9 +23,9 @@ from cfx.calibration.rmse import SpeedRmse
 from cfx.core import registry
 from cfx.core.component import content_key, folder_hash
 from cfx.core.engine import Report, Unfit
-from cfx.core.errors import EngineError, PluginError
 from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
+from cfx.errors import EngineError, PluginError
 from cfx.simulation.base import Stepper
 
 _SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8

@@ -20,7 +20,7 @@ from pydantic import (
     field_validator,
 )
 
-from cfx.core.errors import ConfigError, nearest
+from cfx.errors import ConfigError, nearest
 
 Schema = TypeVar("Schema", bound=BaseModel)
 

@@ -7,7 +7,7 @@ import logging
 import sys
 from typing import TYPE_CHECKING
 
-from cfx.core.errors import printable, without_passwords
+from cfx.errors import printable, without_passwords
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

@@ -12,7 +12,7 @@ from collections.abc import Callable, Collection, Iterator
 from typing import Any, TypeVar
 from weakref import WeakKeyDictionary
 
-from cfx.core.errors import NotInstalledError, PluginError, in_words
+from cfx.errors import NotInstalledError, PluginError, in_words
 
 T = TypeVar("T")
 

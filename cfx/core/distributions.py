@@ -17,7 +17,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from cfx.core.errors import nearest
+from cfx.errors import nearest
 
 OWN = "cfx-driving"
 """cfx's own distribution: no other can replace its components."""

@@ -18,7 +18,7 @@ from filelock import BaseFileLock, FileLock, SoftFileLease
 from pydantic import BeforeValidator
 from pydantic_core import PydanticCustomError
 
-from cfx.core.errors import OutputError
+from cfx.errors import OutputError
 
 _DAY_S = 86400.0
 """Age in seconds, since the last write, at which another machine's temporary file is removed."""

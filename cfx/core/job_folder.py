@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 
 import yaml
 
-from cfx.core.errors import DataError, first_line, without_passwords
+from cfx.errors import DataError, first_line, without_passwords
 
 _LARGEST_MB = 256
 """Texts and weights of a job are smaller."""

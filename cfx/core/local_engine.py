@@ -11,9 +11,9 @@ from loky.backend import get_context
 from loky.process_executor import BrokenProcessPool
 
 from cfx.core.engine import Engine, Report, ResultT, ShardT, Work
-from cfx.core.errors import EngineError
 from cfx.core.processes import worker_pool
 from cfx.core.threads import cores, limit_cores, one_core, one_thread
+from cfx.errors import EngineError
 
 
 class LocalEngine(Engine):

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import psutil  # type: ignore[import-untyped]  # it ships no types
 
-from cfx.core.errors import ConfigError, OutputError
+from cfx.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from numpy.typing import DTypeLike, NDArray

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 from pydantic import Field
 
 from cfx.core.component import Settings
-from cfx.core.errors import ParameterError, nearest
+from cfx.errors import ParameterError, nearest
 
 if TYPE_CHECKING:
     import torch

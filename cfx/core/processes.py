@@ -19,7 +19,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
-from cfx.core.errors import Terminated
+from cfx.errors import Terminated
 
 if TYPE_CHECKING:
     import loky

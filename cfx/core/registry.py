@@ -38,8 +38,8 @@ from pydantic.fields import FieldInfo
 from cfx.core.component import API_VERSION, Component, Settings, validate
 from cfx.core.contract import violations
 from cfx.core.distributions import OWN, advice
-from cfx.core.errors import CfxError, ConfigError, PluginError, Terminated, in_words, nearest
 from cfx.core.guest import same_environment
+from cfx.errors import CfxError, ConfigError, PluginError, Terminated, in_words, nearest
 
 log = logging.getLogger(__name__)
 

@@ -17,8 +17,8 @@ from pathlib import Path
 from typing import Any
 
 from cfx.core.distributions import install_line
-from cfx.core.errors import CfxError, DataError, NotInstalledError, first_line, without_passwords
 from cfx.core.files import atomic_write
+from cfx.errors import CfxError, DataError, NotInstalledError, first_line, without_passwords
 
 _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}
 """Packages that fsspec needs for kinds of URLs."""

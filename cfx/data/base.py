@@ -16,7 +16,6 @@ from pydantic_core import PydanticCustomError
 
 from cfx.core import memory, registry
 from cfx.core.component import Component, Distinct, Settings
-from cfx.core.errors import DataError, PluginError, listed, nearest
 from cfx.core.files import absolute
 from cfx.core.storage import is_url, local_copies
 from cfx.data.check import Check, check_pairs
@@ -25,6 +24,7 @@ from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet, Remark
 from cfx.data.signals import Accelerations, resampled, scaled, with_usable_accelerations
 from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
 from cfx.data.tracks import summed
+from cfx.errors import DataError, PluginError, listed, nearest
 
 log = logging.getLogger(__name__)
 

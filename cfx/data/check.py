@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from cfx.core.errors import DataError, listed
 from cfx.data.kinematics import Contradiction, Units, contradictions, typical_contradiction
 from cfx.data.pairs import PairSet
 from cfx.data.plausible import doubts
+from cfx.errors import DataError, listed
 
 log = logging.getLogger(__name__)
 

@@ -16,7 +16,6 @@ from rich.table import Table
 
 from cfx.core import registry
 from cfx.core.distributions import OWN
-from cfx.core.errors import DataError, PluginError, listed
 from cfx.core.files import path_override
 from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset, rounded_down
@@ -26,7 +25,7 @@ from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.plausible import doubts, rare
 from cfx.data.signals import frames_in_steps
 from cfx.data.style import (
-    ALL,
+    ALL_TYPES,
     INDICATORS,
     NOT_KNOWN,
     STANDING_MPS,
@@ -34,6 +33,7 @@ from cfx.data.style import (
     name_of_indicator,
     styles_by_site,
 )
+from cfx.errors import DataError, PluginError, listed
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -178,7 +178,7 @@ def describe_style(style: StyleResult, distances: pd.DataFrame | None) -> str:
     weights = [f"{style.weights[one.name]:.2f}" for one in INDICATORS]
     table.add_row("entropy weight", "", "", "", *weights)
     for row in sites.to_dict("records"):
-        is_whole = row["driver_type"] == ALL
+        is_whole = row["driver_type"] == ALL_TYPES
         interval = "-"
         if np.isfinite(row["score_low"]):
             interval = f"{row['score_low']:.3f} to {row['score_high']:.3f}"
@@ -195,7 +195,7 @@ def describe_style(style: StyleResult, distances: pd.DataFrame | None) -> str:
             ends = []
             for whose in ("", "other_"):
                 site, kind = row[f"{whose}site"], row[f"{whose}driver_type"]
-                ends.append(str(site) if kind == ALL else f"{site}, {kind}")
+                ends.append(str(site) if kind == ALL_TYPES else f"{site}, {kind}")
             most = name_of_indicator(str(row["most"]))
             apart.add_row(*ends, f"{row['distance']:.3f}", f"{row['p_value']:.3f}", most)
         pieces += ["", apart]

@@ -23,7 +23,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cfx.core.errors import DataError, listed, nearest
+from cfx.errors import DataError, listed, nearest
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

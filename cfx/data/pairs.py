@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfx.core import memory
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 
 if TYPE_CHECKING:
     import torch

@@ -10,8 +10,8 @@ from typing import Annotated
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
-from cfx.core.errors import DataError, listed
 from cfx.data.pairs import Pair, PairSet
+from cfx.errors import DataError, listed
 
 SiteNames = str | dict[str, str] | None
 """One site for all recordings, or the site of each pattern of recordings or files."""

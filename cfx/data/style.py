@@ -25,8 +25,8 @@ from pydantic import Field, model_validator
 
 from cfx.core import memory
 from cfx.core.component import Settings
-from cfx.core.errors import DataError
 from cfx.data.pairs import Pair, PairSet
+from cfx.errors import DataError
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -302,7 +302,7 @@ def entropy_weights(normalised: Floats) -> Floats:
 
 # --- sites ----------------------------------------------------------------------------------------
 
-ALL = "all"
+ALL_TYPES = "all"
 """The drivers of a site whatever drives."""
 
 NOT_KNOWN = "not known"
@@ -347,7 +347,7 @@ def groups(drivers: pd.DataFrame) -> list[Group]:
     found = []
     for site in sites:
         here = np.array([site in names for names in at])
-        found.append(Group(site, ALL, here))
+        found.append(Group(site, ALL_TYPES, here))
         there = dict.fromkeys(kinds[here])
         if len(there) > 1:
             found += [Group(site, str(kind), here & (kinds == kind).to_numpy()) for kind in there]
@@ -449,7 +449,7 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
 def _compared(drivers: pd.DataFrame) -> Iterator[tuple[Group, Group]]:
     """Yields each two sites, then each two types of drivers of a site."""
     every = groups(drivers)
-    yield from combinations([group for group in every if group.driver_type == ALL], 2)
-    for one, other in combinations([group for group in every if group.driver_type != ALL], 2):
+    yield from combinations([group for group in every if group.driver_type == ALL_TYPES], 2)
+    for one, other in combinations([group for group in every if group.driver_type != ALL_TYPES], 2):
         if one.site == other.site:
             yield one, other

@@ -27,8 +27,8 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cfx.core.errors import DataError, first_line, listed, nearest
 from cfx.data.files import PARQUET, Floats, Ints, magic, open_text, read_head, unpacking
+from cfx.errors import DataError, first_line, listed, nearest
 
 if TYPE_CHECKING:
     from numpy import bool_
@@ -46,7 +46,7 @@ _PANDAS_INDEX = "__index_level_0__"
 
 
 @dataclass(frozen=True)
-class Column:
+class FileColumn:
     """One column of a layout.
 
     Attributes:
@@ -113,7 +113,7 @@ class Layout:
     """
 
     name: str
-    columns: tuple[Column, ...]
+    columns: tuple[FileColumn, ...]
     keys: Mapping[str, str] = field(default_factory=dict)
     elsewhere: Mapping[str, str] = field(default_factory=dict)
     remedy: str = "correct it or remove the row"
@@ -154,7 +154,7 @@ class Layout:
         return found
 
     def _found(
-        self, column: Column, at: Mapping[str, int], plain: Mapping[str, int]
+        self, column: FileColumn, at: Mapping[str, int], plain: Mapping[str, int]
     ) -> list[_Found]:
         """Returns where a column is: once, or as often as its pattern matches."""
         if column.many:
@@ -168,7 +168,7 @@ class Layout:
                 return [_Found(column, plain[self.plain(name)])]
         return []
 
-    def _missing(self, source: str, missing: Sequence[Column], names: Sequence[str]) -> str:
+    def _missing(self, source: str, missing: Sequence[FileColumn], names: Sequence[str]) -> str:
         """Returns what to say of columns that are not there."""
         missing = sorted(missing, key=lambda column: bool(column.unless))
         first = missing[0]
@@ -195,11 +195,11 @@ class Layout:
 class _Found(NamedTuple):
     """A column of a layout, and its position in a file."""
 
-    column: Column
+    column: FileColumn
     at: int
 
 
-class Labels(NamedTuple):
+class NameColumn(NamedTuple):
     """A column of names: `codes` `(N,)` points into `names`; -1 is an empty cell."""
 
     codes: Ints
@@ -228,7 +228,7 @@ class Table:
     source: str
     layout: Layout
     numbers: Mapping[str, Floats]
-    labels: Mapping[str, Labels]
+    labels: Mapping[str, NameColumn]
     first_row: int
     ignored: Sequence[str]
 
@@ -358,7 +358,7 @@ def _checked(source: _Source, found: Mapping[str, _Found], columns: Any) -> Tabl
         if at not in used and name != _PANDAS_INDEX:
             ignored.append(name if name not in {"", "None"} else f"column {at + 1} without a name")
     numbers: dict[str, Floats] = {}
-    labels: dict[str, Labels] = {}
+    labels: dict[str, NameColumn] = {}
     table = Table(source.name, source.layout, numbers, labels, source.first_row, ignored)
     for name, one in found.items():
         cells = columns.column(source.columns[one.at])
@@ -379,7 +379,7 @@ def _checked(source: _Source, found: Mapping[str, _Found], columns: Any) -> Tabl
     return table
 
 
-def _require_names(table: Table, name: str, labels: Labels) -> None:
+def _require_names(table: Table, name: str, labels: NameColumn) -> None:
     """Raises DataError for an empty cell of a column of names."""
     empty = np.flatnonzero(labels.codes < 0)
     if len(empty):
@@ -388,7 +388,7 @@ def _require_names(table: Table, name: str, labels: Labels) -> None:
         )
 
 
-def _require_numbers(table: Table, name: str, values: Floats, column: Column) -> None:
+def _require_numbers(table: Table, name: str, values: Floats, column: FileColumn) -> None:
     """Raises DataError for a cell that is no finite number, or not what its column declares."""
     is_bad = ~np.isfinite(values)
     if column.may_be_empty:
@@ -444,7 +444,7 @@ def _floats(table: Table, name: str, column: Any) -> Floats:
     return values
 
 
-def _labels(table: Table, name: str, column: Any) -> Labels:
+def _labels(table: Table, name: str, column: Any) -> NameColumn:
     """Returns an Arrow column as names, in the order in which they first appear."""
     where = f"column {table.title(name)}"
     if pa.types.is_nested(column.type):
@@ -467,13 +467,13 @@ def _labels(table: Table, name: str, column: Any) -> Labels:
     if isinstance(column, pa.ChunkedArray):
         column = column.unify_dictionaries().combine_chunks()
     if isinstance(column, pa.ChunkedArray):  # no chunk at all
-        return Labels(np.zeros(0, np.int64), [])
+        return NameColumn(np.zeros(0, np.int64), [])
     written: list[str | None] = []
     for one in column.dictionary.to_pylist():
         written.append(str(one).strip() or None)
     merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
     codes = pc.fill_null(column.indices, len(written)).to_numpy(zero_copy_only=False)
-    return Labels(np.append(merged, -1).astype(np.int64)[codes], list(names))
+    return NameColumn(np.append(merged, -1).astype(np.int64)[codes], list(names))
 
 
 def _first_broken(column: Any) -> str:

@@ -48,7 +48,6 @@ from pydantic_core import PydanticCustomError
 
 from cfx.core import memory
 from cfx.core.component import Settings
-from cfx.core.errors import OutputError, listed
 from cfx.core.files import atomic_write
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import (
@@ -63,9 +62,10 @@ from cfx.data.files import (
     recording_of,
 )
 from cfx.data.pairs import Dropped, Pair, PairSet
-from cfx.data.table import Column, Layout, Table, read_table, table_of
+from cfx.data.table import FileColumn, Layout, Table, read_table, table_of
 from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, check_gap, time_steps
 from cfx.data.units import factor
+from cfx.errors import OutputError, listed
 
 LABELS = ("recording", "pair_id", "leader_id", "follower_id")
 """Columns of names that every pair has."""
@@ -95,31 +95,34 @@ _REVERSING = "is negative; speeds count along the lane and must be 0 or more"
 LAYOUT = Layout(
     name="the tidy layout",
     columns=(
-        *[Column(name, is_name=True, needed=name == "pair_id") for name in LABELS],
-        Column(
+        *[FileColumn(name, is_name=True, needed=name == "pair_id") for name in LABELS],
+        FileColumn(
             "frame",
             needed=False,
             whole=True,
             wrong="is no whole number; number the frames 0, 1, 2, ...",
         ),
-        Column("time_s", "s"),
-        Column("leader_position_m", "m", unless=GAP),
-        Column("leader_speed_mps", "m/s", least=0, wrong=_REVERSING),
-        Column("leader_acceleration_mps2", "m/s2", unless=GAP),
-        Column("follower_position_m", "m", unless=GAP),
-        Column("follower_speed_mps", "m/s", least=0, wrong=_REVERSING),
-        Column("follower_acceleration_mps2", "m/s2", unless=GAP),
-        Column(
+        FileColumn("time_s", "s"),
+        FileColumn("leader_position_m", "m", unless=GAP),
+        FileColumn("leader_speed_mps", "m/s", least=0, wrong=_REVERSING),
+        FileColumn("leader_acceleration_mps2", "m/s2", unless=GAP),
+        FileColumn("follower_position_m", "m", unless=GAP),
+        FileColumn("follower_speed_mps", "m/s", least=0, wrong=_REVERSING),
+        FileColumn("follower_acceleration_mps2", "m/s2", unless=GAP),
+        FileColumn(
             LENGTH,
             "m",
             unless=GAP,
             least=0,
             wrong="is no vehicle length; give metres, or 0 where positions are of rear bumpers",
         ),
-        Column(GAP, "m", needed=False),
-        Column(LANE, needed=False, may_be_empty=True, whole=True, wrong="is no lane number"),
-        *[Column(name, is_name=True, needed=False, may_be_empty=True) for name in OPTIONAL_LABELS],
-        Column(f"{TRUE}.+", many=True, needed=False, may_be_empty=True),
+        FileColumn(GAP, "m", needed=False),
+        FileColumn(LANE, needed=False, may_be_empty=True, whole=True, wrong="is no lane number"),
+        *[
+            FileColumn(name, is_name=True, needed=False, may_be_empty=True)
+            for name in OPTIONAL_LABELS
+        ],
+        FileColumn(f"{TRUE}.+", many=True, needed=False, may_be_empty=True),
     ),
     keys={"pair": "pair_id", "frame": "frame"},
     elsewhere=dict.fromkeys(("Vehicle_ID", "vehicle_id", "Local_Y", "local_y"), _NGSIM),
@@ -262,7 +265,7 @@ class TidySettings(FileDatasetSettings):
         own: str | None = getattr(self.units, name, None)
         return own or getattr(self.units, name.removeprefix("leader_"), None)
 
-    def _own(self, name: str, column: Column) -> Column:
+    def _own(self, name: str, column: FileColumn) -> FileColumn:
         """Returns a column with the name and the unit that the file has for it."""
         called = getattr(self.columns, name)
         if called is not None:

@@ -14,12 +14,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.core.errors import DataError
 from cfx.data.files import Floats, Ints
 from cfx.data.kinematics import contradiction
 from cfx.data.pairs import Pair
-from cfx.data.table import Labels, Table
+from cfx.data.table import NameColumn, Table
 from cfx.data.tracks import accelerations, driven
+from cfx.errors import DataError
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +57,7 @@ def _with_names_and_frames(table: Table) -> Table:
     pair = labels["pair_id"]
     if "recording" not in labels:
         name = Path(table.source).name.partition(".")[0]
-        labels["recording"] = Labels(np.zeros(len(table), dtype=np.int64), [name])
+        labels["recording"] = NameColumn(np.zeros(len(table), dtype=np.int64), [name])
     if "follower_id" not in labels:
         log.warning(
             "%s: without a column %s each pair counts as a driver of its own",
@@ -66,7 +66,7 @@ def _with_names_and_frames(table: Table) -> Table:
         )
         labels["follower_id"] = pair
     if "leader_id" not in labels:
-        labels["leader_id"] = Labels(pair.codes, [f"ahead of {name}" for name in pair.names])
+        labels["leader_id"] = NameColumn(pair.codes, [f"ahead of {name}" for name in pair.names])
     if "frame" not in numbers:
         time = numbers["time_s"]
         order = np.lexsort((time, pair.codes))

@@ -17,10 +17,10 @@ from torch import Tensor
 
 from cfx.core import memory
 from cfx.core.distributions import OWN
-from cfx.core.errors import in_words
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import CLUSTERS, StyleResult
+from cfx.errors import in_words
 from cfx.evaluation.closed_loop import PAIRS_AT_ONCE, ClosedLoop
 from cfx.evaluation.metrics.base import (
     RECORDED,

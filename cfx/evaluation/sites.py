@@ -13,7 +13,7 @@ from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.statistics import improvement_statistics
 from cfx.evaluation.tables import values_of
 
-ALL = "all"
+ALL_SITES = "all"
 """What the row is called in which each site counts once, and a row of all types of drivers."""
 
 BASELINES = ("fixed", "population")
@@ -51,12 +51,12 @@ def site_table(pairs: PairSet, evaluation: Evaluation, *, seed: int) -> pd.DataF
             continue
         about = labels.loc[speed.index]
         for site, of_site in about.groupby("site", sort=False):
-            rows.append(_row(scope, str(site), ALL, of_site, speed, gap, seed))
+            rows.append(_row(scope, str(site), ALL_SITES, of_site, speed, gap, seed))
             if len(set(of_site["driver_type"])) > 1:
                 for kind, of_kind in of_site.groupby("driver_type", sort=False):
                     name = str(kind) or "not known"
                     rows.append(_row(scope, str(site), name, of_kind, speed, gap, seed))
-        every = [row for row in rows if row["scope"] == scope and row["driver_type"] == ALL]
+        every = [row for row in rows if row["scope"] == scope and row["driver_type"] == ALL_SITES]
         rows.append(_mean_of_sites(scope, every, about, speed, seed))
     return pd.DataFrame(rows)
 
@@ -125,8 +125,8 @@ def _mean_of_sites(
     table = pd.DataFrame(rows)
     row: dict[str, object] = {
         "scope": scope,
-        "site": ALL,
-        "driver_type": ALL,
+        "site": ALL_SITES,
+        "driver_type": ALL_SITES,
         "pairs": int(table["pairs"].sum()),
         "drivers": int(table["drivers"].sum()),
     }

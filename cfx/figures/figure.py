@@ -19,8 +19,8 @@ import pandas as pd
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.distributions import install_line
-from cfx.core.errors import DataError, OutputError, listed, nearest
 from cfx.core.files import atomic_write
+from cfx.errors import DataError, OutputError, listed, nearest
 from cfx.evaluation.result import Purpose
 from cfx.simulation.trajectory import TRANSIENT_S
 

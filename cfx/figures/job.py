@@ -18,7 +18,6 @@ import numpy as np
 import pandas as pd
 from pydantic import TypeAdapter, ValidationError
 
-from cfx.core.errors import DataError, without_passwords
 from cfx.core.job_folder import (
     examine,
     optional,
@@ -29,6 +28,7 @@ from cfx.core.job_folder import (
     read_yaml_list,
 )
 from cfx.data.style import StyleResult
+from cfx.errors import DataError, without_passwords
 from cfx.evaluation.headline import improvement_key
 from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo, column_of, key_of
 from cfx.evaluation.result import METHODS, PairTrajectory, Purpose

@@ -21,9 +21,9 @@ from cfx.calibration.objectives import Objective
 from cfx.calibration.rmse import SpeedRmse
 from cfx.core.component import Component
 from cfx.core.engine import Engine
-from cfx.core.errors import ConfigError
 from cfx.core.local_engine import LocalEngine
 from cfx.data.pairs import PairBatch
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, Scaler, measured_history

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader
 
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx.learners.base import TrainingData
 from cfx.learners.batched import BatchedModule, Training
 from cfx.policies.base import Policy, PolicyNetwork

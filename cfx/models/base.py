@@ -20,8 +20,8 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.core.component import Component, Settings
-from cfx.core.errors import ConfigError
 from cfx.core.parameters import ParameterOverride, ParameterSpace
+from cfx.errors import ConfigError
 from cfx.models.limits import LimitSettings
 from cfx.models.regimes import Temperature
 

@@ -42,8 +42,8 @@ import torch
 from torch import Tensor
 
 from cfx.core.component import content_key, folder_hash
-from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.regimes import Temperature, safe_sqrt
 

@@ -15,8 +15,8 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.core.component import Settings
-from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
 from cfx.models.regimes import safe_sqrt
 from cfx.models.vtype import VType, sumo_speed

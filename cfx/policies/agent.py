@@ -22,17 +22,17 @@ import torch
 from torch import Tensor
 
 from cfx.core import registry
-from cfx.core.errors import DataError, PluginError
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import PairBatch, PairSet
+from cfx.errors import DataError, PluginError
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.context import UNSEEN, ContextRule, DriverContext, ExpectedError
-from cfx.policies.core import ALL, AgentCore, driver_places
+from cfx.policies.core import ANY_DRIVER, AgentCore, driver_places
 from cfx.policies.driver_features import measure
 from cfx.policies.features import History, Scaler, measured_history
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.offset import blended, shrunk
-from cfx.policies.valid_range import SIGNALS, ValidRange, situation_of, weight_of_answer
+from cfx.policies.valid_range import RANGE_SIGNALS, ValidRange, situation_of, weight_of_answer
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import WindowSettings
 
@@ -242,7 +242,7 @@ class Agent:
         conditioning = self.core.condition(known, features)
         score = torch.zeros(len(network), dtype=torch.float64, device=network.device)
         beyond = torch.zeros(
-            (len(network), 2 * len(SIGNALS)), dtype=torch.bool, device=network.device
+            (len(network), 2 * len(RANGE_SIGNALS)), dtype=torch.bool, device=network.device
         )
         latent = score.new_zeros((len(network), self.head.latent_width))
         return AgentState(network, place, state, base, conditioning, score, beyond, latent)
@@ -387,8 +387,8 @@ class Agent:
         for pair in pairs:
             if pair.pair_id in self.names:
                 numbers.append(self.names.index(pair.pair_id))
-            elif ALL in self.names:
-                numbers.append(self.names.index(ALL))
+            elif ANY_DRIVER in self.names:
+                numbers.append(self.names.index(ANY_DRIVER))
             else:
                 raise DataError(
                     f"pair '{pair.pair_id}' has no network of its own among the {len(self.names)}"
@@ -405,12 +405,12 @@ class Agent:
         """
         if len(self.names) == 1:
             return self
-        if ALL not in self.names:
+        if ANY_DRIVER not in self.names:
             raise DataError(
                 f"the policy has {len(self.names)} networks, one for each of its own pairs, and"
                 " none for others; train one with protocol.networks=all or protocol=across_drivers"
             )
-        return self.only(torch.tensor([self.names.index(ALL)]))
+        return self.only(torch.tensor([self.names.index(ANY_DRIVER)]))
 
     def only(self, numbers: Tensor) -> Agent:
         """Returns the agent with some of its networks, `(M,)` int64, which are numbered anew."""

@@ -17,9 +17,9 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from cfx.core import registry
-from cfx.core.errors import ConfigError, DataError, ParameterError
 from cfx.core.files import atomic_write
 from cfx.core.job_folder import examine, parse_json
+from cfx.errors import ConfigError, DataError, ParameterError
 from cfx.models.base import DrivingModel
 from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.base import Policy
@@ -28,7 +28,7 @@ from cfx.policies.core import AgentCore, features_read, network_with_weights
 from cfx.policies.features import Scaler
 from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
-from cfx.policies.valid_range import SIGNALS, ValidRange
+from cfx.policies.valid_range import RANGE_SIGNALS, ValidRange
 from cfx.simulation.windows import WindowSettings
 
 _FORMAT = 3
@@ -40,7 +40,7 @@ _RANGE = "valid_range."
 """Prefix of the names of the valid range's tensors."""
 
 
-def save(agent: Agent, folder: Path) -> None:
+def save_agent(agent: Agent, folder: Path) -> None:
     """Writes `policy.safetensors` and `policy.json`; each appears whole.
 
     Raises:
@@ -55,7 +55,7 @@ def save(agent: Agent, folder: Path) -> None:
         temporary.write_text(text + "\n", encoding="utf-8")
 
 
-def load(folder: Path | str) -> Agent:
+def load_agent(folder: Path | str) -> Agent:
     """Reads what `save` wrote, on the CPU.
 
     Raises:
@@ -153,7 +153,7 @@ def _agent(
         raise ValueError(f"there are weights of {networks} networks")
     if head.needs_base and "base" not in weights:
         raise ValueError(f"the head '{head.name}' needs 'base'")
-    signals, shape = len(SIGNALS), (networks,)
+    signals, shape = len(RANGE_SIGNALS), (networks,)
     shapes = {
         "base": (*shape, len(head.space)),
         "population": (*shape, len(head.model_space)),

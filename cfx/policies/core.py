@@ -16,7 +16,7 @@ from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, Scaler, token_width, tokens
 from cfx.policies.heads.base import ParameterHead
 
-ALL = "all"
+ANY_DRIVER = "all"
 """Name of the network that is for any driver."""
 
 _EDGE = 1e-6

@@ -15,8 +15,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.core.errors import ConfigError
 from cfx.core.registry import create
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.context import UNSEEN, DriverContext

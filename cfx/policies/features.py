@@ -12,8 +12,8 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from cfx.core.errors import nearest
 from cfx.data.pairs import PairBatch
+from cfx.errors import nearest
 
 Summary = Literal["frames", "last", "mean", "mean_std"]
 

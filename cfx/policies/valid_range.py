@@ -28,7 +28,7 @@ FADED = 2.5
 """Score from which on nothing is left of an agent's answer. Nearer bounds are worse: mixtures of an
 answer and the base can be worse than either, and just outside the answers are still good."""
 
-SIGNALS = (
+RANGE_SIGNALS = (
     "follower_speed",
     "follower_acceleration",
     "leader_acceleration",
@@ -188,10 +188,10 @@ def in_words(valid_range: ValidRange, beyond: Tensor) -> str:
         return ""
     signal = int(beyond.argmax())
     side, bounds = "below", valid_range.low[0]
-    if signal >= len(SIGNALS):
-        side, bounds, signal = "above", valid_range.high[0], signal - len(SIGNALS)
+    if signal >= len(RANGE_SIGNALS):
+        side, bounds, signal = "above", valid_range.high[0], signal - len(RANGE_SIGNALS)
     bound = float(bounds[signal])
-    if SIGNALS[signal] == "log_gap":
+    if RANGE_SIGNALS[signal] == "log_gap":
         bound = float(torch.expm1(bounds[signal]))
     return f"{_WORDS[signal]} {side} {bound:.3g} {_UNITS[signal]}"
 

@@ -14,9 +14,9 @@ from pydantic import Field, field_validator
 
 from cfx.calibration.settings import CalibrationSettings
 from cfx.core.component import Distinct, Settings, each_once, validate
-from cfx.core.errors import ConfigError, without_passwords
 from cfx.core.storage import is_url
 from cfx.data.style import StyleSettings
+from cfx.errors import ConfigError, without_passwords
 from cfx.simulation.settings import WindowSettings
 
 Node = dict[str, Any]

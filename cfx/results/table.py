@@ -23,9 +23,9 @@ import pyarrow.parquet as pq
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.errors import DataError, PluginError
 from cfx.core.job_folder import unreadable
 from cfx.core.memory import in_units, total_memory
+from cfx.errors import DataError, PluginError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType

@@ -28,7 +28,7 @@ from cfx.calibration.settings import (
 from cfx.core.parameters import Parameter
 from cfx.data.style import INDICATORS, style_distances, styles_by_site
 from cfx.evaluation.result import METHODS
-from cfx.evaluation.sites import ALL, BASELINES
+from cfx.evaluation.sites import ALL_SITES, BASELINES
 from cfx.evaluation.tables import scope_label
 from cfx.learners.curves import best_losses
 from cfx.policies.context import LEVEL as EXPECTED_LEVEL
@@ -499,7 +499,7 @@ class Sites(ResultTable):
         table = findings.sites
         if table is None:
             return found
-        for _, row in table[table["driver_type"] == ALL].iterrows():
+        for _, row in table[table["driver_type"] == ALL_SITES].iterrows():
             site = re.sub(r"[^\w.\- ]", "_", str(row["site"]))
             part = "" if row["scope"] == "test" else "full_trajectory/"
             for column in row.index.intersection(list(columns)):
@@ -528,7 +528,7 @@ def _sites_printed(rows: pd.DataFrame, scope: str) -> Table:
         table.add_column(f"over {baseline}", justify="right")
     for _, row in rows.iterrows():
         name = escape(str(row["site"]))
-        if row["driver_type"] != ALL:
+        if row["driver_type"] != ALL_SITES:
             name = f"  {escape(str(row['driver_type']))}"
         cells = [f"{row[f'rmse_speed_{method}']:.3f}" for method in methods]
         for baseline in baselines:

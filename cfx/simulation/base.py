@@ -11,7 +11,7 @@ from torch import Tensor
 
 from cfx.core import registry
 from cfx.core.component import Component, Settings
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.trajectory import Segments, Start, Terms
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cfx.core import registry
 from cfx.core.contract import NotApplicable, expect_tensor, once
-from cfx.core.errors import CfxError, ConfigError
+from cfx.errors import CfxError, ConfigError
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.contract import DRIVES, DT, in_dtype, ordinary
 from cfx.simulation.base import Simulator, Stepper

@@ -26,9 +26,9 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.core.component import Settings, folder_hash
-from cfx.core.errors import ParameterError
 from cfx.core.guest import same_environment
 from cfx.core.threads import one_thread
+from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Simulator, SimulatorSettings, Stepper
 from cfx.simulation.kernel import run as kernel

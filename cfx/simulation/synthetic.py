@@ -22,10 +22,10 @@ from numpy.typing import NDArray
 from pydantic import Field, field_validator
 
 from cfx.core.component import Settings
-from cfx.core.errors import DataError
 from cfx.core.memory import require_memory
 from cfx.data.base import Dataset, DatasetSettings
 from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.errors import DataError
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cfx.core.errors import DataError
 from cfx.data.pairs import PairSet
+from cfx.errors import DataError
 from cfx.simulation.settings import WindowSettings
 from cfx.simulation.trajectory import TRANSIENT_S
 

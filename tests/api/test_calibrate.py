@@ -15,7 +15,7 @@ from torch import Tensor
 import cfx
 from cfx.app.overrides import override
 from cfx.calibration.calibrator import Calibrator
-from cfx.core.errors import CfxError, ConfigError, DataError, ParameterError
+from cfx.errors import CfxError, ConfigError, DataError, ParameterError
 from cfx.results.table import read_tables
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 256}

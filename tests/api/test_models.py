@@ -9,7 +9,7 @@ from torch import Tensor
 
 import cfx
 from cfx.core import registry
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 
 

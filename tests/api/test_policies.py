@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 import cfx
-from cfx.core.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 64}
 SMALL = {

@@ -12,7 +12,7 @@ from sklearn.model_selection import GroupKFold, cross_val_score
 from sklearn.utils import estimator_checks
 
 import cfx
-from cfx.core.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError
 from cfx.sklearn import CarFollowingRegressor
 
 CHECKS = (

@@ -22,10 +22,10 @@ import numpy as np
 import pandas as pd
 
 from cfx.core import registry
-from cfx.core.errors import CfxError
 from cfx.data.base import Dataset
 from cfx.data.pairs import SIGNALS, Pair, PairSet
 from cfx.data.tidy import TidyDataset
+from cfx.errors import CfxError
 from tests.data.layouts import write_fcd
 
 FOOT = 0.3048

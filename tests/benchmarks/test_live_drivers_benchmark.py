@@ -52,7 +52,7 @@ def test_three_hundred_live_drivers(benchmark, tmp_path: Path) -> None:
         '<time><step-length value="0.1"/></time></configuration>'
     )
     for name in ("krauss", "w99"):
-        checkpoint.save(adaptive({"name": name}), tmp_path / name / "policy")
+        checkpoint.save_agent(adaptive({"name": name}), tmp_path / name / "policy")
 
     def run() -> list[float]:
         command = [sys.executable, "-c", SCRIPT, str(SECONDS)]

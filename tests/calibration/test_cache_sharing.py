@@ -12,7 +12,7 @@ import pytest
 
 from cfx.calibration.cache import Cache
 from cfx.core.component import content_key
-from cfx.core.errors import OutputError
+from cfx.errors import OutputError
 from tests.forks import Fork, Forks
 
 PAIRS, GROUP = 24, 4

@@ -25,8 +25,8 @@ from cfx.calibration.shards import CalibrationShard, Solver
 from cfx.calibration.theil_u import TheilU
 from cfx.core import threads
 from cfx.core.engine import Engine, Report
-from cfx.core.errors import OutputError
 from cfx.data.pairs import PairBatch, PairSet
+from cfx.errors import OutputError
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99

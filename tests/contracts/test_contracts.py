@@ -10,7 +10,7 @@ import pytest
 
 from cfx.core import registry
 from cfx.core.contract import NotApplicable, violations
-from cfx.core.errors import NotInstalledError, PluginError
+from cfx.errors import NotInstalledError, PluginError
 from cfx.models.krauss import Krauss
 from cfx_contracts import check_contract, contract_for
 

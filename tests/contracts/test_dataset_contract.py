@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cfx.core.errors import PluginError
 from cfx.data.base import Dataset, DatasetSettings
 from cfx.data.pairs import Pair, PairSet
+from cfx.errors import PluginError
 from cfx_contracts import datasets as checks
 from tests.drives import straight_pairs
 
@@ -63,7 +63,7 @@ class Selecting(Straight):
 
 class Silent(Straight):
     def load(self) -> PairSet:
-        from cfx.core.errors import DataError
+        from cfx.errors import DataError
 
         if self.settings.min_duration > 90:
             raise DataError("no pairs")

@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from cfx.core.contract import Check, NotApplicable
-from cfx.core.errors import DataError
 from cfx.data.pairs import PairSet
+from cfx.errors import DataError
 from cfx.evaluation.demo import PAGE, Demo
 from cfx_contracts import check_contract
 from cfx_contracts import demos as checks

@@ -13,7 +13,7 @@ from cfx.calibration import contract as first
 from cfx.calibration.optimizers import CandidateLosses, Optimizer
 from cfx.calibration.random_search import RandomSearch
 from cfx.core.contract import violations
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 from cfx_contracts import check_contract
 from cfx_contracts import optimizers as checks
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.core.errors import ConfigError, SumoError
+from cfx.errors import ConfigError, SumoError
 from cfx.models.base import DrivingModel, Follower
 from cfx.models.krauss import Krauss
 from cfx.simulation import contract as first

@@ -7,8 +7,8 @@ import signal
 
 import pytest
 
-from cfx.core.errors import Terminated
 from cfx.core.processes import raise_if_signalled, terminable
+from cfx.errors import Terminated
 
 
 @pytest.mark.parametrize(

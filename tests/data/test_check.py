@@ -9,12 +9,12 @@ import pytest
 import torch
 
 import cfx
-from cfx.core.errors import DataError
 from cfx.data.base import Dataset
 from cfx.data.check import judge
 from cfx.data.describe import describe
 from cfx.data.pairs import Pair, PairSet, Remark
 from cfx.data.tidy import TidyDataset, frame_of, write_tidy
+from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from tests.drives import wavy_pairs
 

@@ -10,9 +10,9 @@ import pandas as pd
 import pytest
 import torch
 
-from cfx.core.errors import DataError
 from cfx.data.describe import describe
 from cfx.data.tidy import TidyDataset, frame_of
+from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from tests.drives import wavy_pairs
 

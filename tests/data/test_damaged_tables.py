@@ -11,8 +11,8 @@ import pyarrow.parquet as pq
 import pytest
 
 from cfx.app import cli
-from cfx.core.errors import ConfigError, DataError
 from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.errors import ConfigError, DataError
 from tests.drives import straight_pairs
 
 ROWS = 60

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from cfx.core.errors import DataError
 from cfx.data.describe import describe
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.errors import DataError
 from cfx.simulation.synthetic import SyntheticDataset
 from tests.drives import straight_pairs
 from tests.installer import Installer

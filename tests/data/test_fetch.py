@@ -18,7 +18,7 @@ from urllib.parse import parse_qs, urlsplit
 import pytest
 
 from cfx.app import cli
-from cfx.core.errors import CfxError, ConfigError, DataError, OutputError
+from cfx.errors import CfxError, ConfigError, DataError, OutputError
 from cfx_recordings.fetch import COLUMNS, fetch_ngsim_i80
 from cfx_recordings.ngsim import read_ngsim
 

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cfx.core.errors import DataError
 from cfx.data.describe import describe
 from cfx.data.pairs import PairSet
+from cfx.errors import DataError
 from cfx_recordings.ngsim import FOOT, NgsimDataset, read_ngsim
 
 COLUMNS = [

@@ -11,9 +11,9 @@ import pytest
 import torch
 
 from cfx.app import cli
-from cfx.core.errors import ConfigError, DataError
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, TidySettings, frame_of, pairs_from_frame
+from cfx.errors import ConfigError, DataError
 from cfx.models.krauss import Krauss
 from tests.drives import wavy_pairs
 

@@ -12,12 +12,12 @@ import pyarrow.parquet as pq
 import pytest
 
 from cfx.app.sweep.folder import fingerprint
-from cfx.core.errors import DataError
 from cfx.data import tidy
 from cfx.data.describe import describe
 from cfx.data.pairs import PairSet
 from cfx.data.table import Layout
 from cfx.data.tidy import TidyDataset, read_tidy, write_tidy
+from cfx.errors import DataError
 from tests.drives import straight_pairs
 
 

@@ -10,10 +10,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
 from cfx.data.signals import resampled
 from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.errors import ConfigError
 
 
 def swinging(frames: int, dt: float, name: str = "a") -> Pair:

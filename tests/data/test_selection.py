@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from cfx.core.component import Settings
-from cfx.core.errors import ConfigError, DataError
 from cfx.data.base import Dataset, DatasetSettings, FileDatasetSettings
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.tidy import TidyDataset
+from cfx.errors import ConfigError, DataError
 
 
 def a_pair(name: str, frames: int, recording: str = "r", lane: int | None = None) -> Pair:

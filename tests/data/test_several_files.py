@@ -10,10 +10,10 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from cfx.core.errors import ConfigError, DataError
 from cfx.data.base import joined
 from cfx.data.pairs import Dropped, PairSet
 from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.errors import ConfigError, DataError
 from cfx_recordings.ngsim import NgsimDataset
 from tests.data.test_ngsim import CLOCK, save, traffic
 from tests.drives import straight_pairs

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cfx.core.errors import ConfigError, DataError
 from cfx.data.pairs import Pair, PairSet
 from cfx.data.tidy import TidyDataset, read_tidy, write_tidy
+from cfx.errors import ConfigError, DataError
 
 
 def a_pair(recording: str, follower: str, kind: str = "", speed: float = 10.0) -> Pair:

@@ -12,7 +12,6 @@ from hypothesis.extra.numpy import arrays
 from scipy.stats import entropy
 
 from cfx.core.component import validate
-from cfx.core.errors import ConfigError, DataError
 from cfx.data.pairs import Pair, PairSet
 from cfx.data.style import (
     INDICATORS,
@@ -24,6 +23,7 @@ from cfx.data.style import (
     normalise,
     select_cluster,
 )
+from cfx.errors import ConfigError, DataError
 
 # Whole numbers keep columns either constant or clearly spread: rounding itself is tested apart.
 MATRICES = st.integers(1, 20).flatmap(

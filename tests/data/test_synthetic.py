@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from cfx.core.errors import ConfigError
 from cfx.data.pairs import Pair, PairSet
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss

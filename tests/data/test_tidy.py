@@ -13,9 +13,9 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from cfx.core.errors import DataError, OutputError
 from cfx.data.pairs import SIGNALS, Pair, PairSet
 from cfx.data.tidy import TidyDataset, pairs_from_frame, read_tidy, write_tidy
+from cfx.errors import DataError, OutputError
 from cfx.simulation.synthetic import SyntheticDataset
 
 

@@ -22,7 +22,7 @@ import cfx.data.tidy
 import cfx.figures.figure
 import cfx.policies.checkpoint
 from cfx.app import cli
-from cfx.core.errors import Terminated
+from cfx.errors import Terminated
 from tests.broken_plugins import QUICK
 
 JOB = [one for one in QUICK if not one.startswith(("figures", "cache", "policy"))]

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 
 import cfx
 from cfx.app import cli
-from cfx.core.errors import CfxError
+from cfx.errors import CfxError
 from cfx.evaluation.protocols.transfer import Transfer, TransferSettings
 from cfx.policies import checkpoint
 from cfx_report.page import render
@@ -60,7 +60,7 @@ def load(folder: Path) -> Any:
 
 
 def load_policy(folder: Path) -> Any:
-    return checkpoint.load(folder / "policy")
+    return checkpoint.load_agent(folder / "policy")
 
 
 def report(folder: Path) -> str:

@@ -23,9 +23,9 @@ from cfx.app.hydra_source import composed, plain
 from cfx.app.user_errors import explain, is_user_error
 from cfx.calibration.cache import Cache
 from cfx.core import registry
-from cfx.core.errors import CfxError
 from cfx.data.describe import describe
 from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.errors import CfxError
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.mlflow.tracker import MlflowTracker
@@ -194,7 +194,7 @@ def damaged(content: bytes, data: st.DataObject) -> bytes:
 @fuzz
 @given(data=st.data())
 def test_any_saved_policy(data: st.DataObject, tmp_path: Path) -> None:
-    checkpoint.save(adaptive({"name": "krauss"}, offsets=True), tmp_path)
+    checkpoint.save_agent(adaptive({"name": "krauss"}, offsets=True), tmp_path)
     description = tmp_path / "policy.json"
     if data.draw(st.booleans()):
         values = json.loads(description.read_text())
@@ -205,7 +205,7 @@ def test_any_saved_policy(data: st.DataObject, tmp_path: Path) -> None:
         path = tmp_path / name
         path.write_bytes(damaged(path.read_bytes(), data))
     try:
-        agent = checkpoint.load(tmp_path)
+        agent = checkpoint.load_agent(tmp_path)
         agent.begin(torch.zeros(1, dtype=torch.int64))
     except CfxError as error:
         said(error)

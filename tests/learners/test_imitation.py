@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from cfx.calibration.calibrator import Labels
-from cfx.core.errors import DataError
 from cfx.data.pairs import PairBatch
+from cfx.errors import DataError
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.learners.imitation import ImitationLearner
 from cfx.models.krauss import Krauss
-from cfx.policies.checkpoint import load, save
+from cfx.policies.checkpoint import load_agent, save_agent
 from cfx.policies.context import DriverContext
 from cfx.policies.core import group_by
 from cfx.policies.features import measured_history
@@ -146,8 +146,8 @@ def test_a_saved_policy_of_offsets_answers_the_same(tmp_path: Path) -> None:
         learner.fit(policy, replace(data, pairs=replace(data.pairs, base=own))), data, policy
     )
     agent = replace(agent, model_node={"name": "krauss"}, policy_node={"name": "gru"})
-    save(agent, tmp_path)
-    again = load(tmp_path)
+    save_agent(agent, tmp_path)
+    again = load_agent(tmp_path)
     assert again.head.name == "offset"
     history = measured_history(data.batch, torch.arange(3), torch.full((3,), 50), SETTINGS.length)
     answers = []

@@ -7,7 +7,7 @@ import torch
 
 from cfx.app import hydra_source
 from cfx.core import registry
-from cfx.core.errors import ConfigError, ParameterError
+from cfx.errors import ConfigError, ParameterError
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.heads.offset import moved

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.core.errors import ConfigError
 from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.composed import RESIDUAL, WithResidual
 from cfx.models.idm import IDM

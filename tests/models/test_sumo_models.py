@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.models.krauss import Krauss
 from cfx.models.vtype import sumo_speed
 from cfx.models.w99 import W99

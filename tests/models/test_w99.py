@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import cfx
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.models.base import Follower, Leader
 from cfx.models.w99 import W99
 from cfx_contracts import check_contract

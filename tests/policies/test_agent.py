@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.core.errors import DataError
 from cfx.data.pairs import PairBatch
+from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from cfx.policies.context import DriverContext
 from cfx.policies.features import measured_history

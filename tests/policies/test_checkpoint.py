@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from cfx.core.errors import DataError
 from cfx.data.pairs import PairBatch
+from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent, TrainedOn
@@ -42,8 +42,8 @@ def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, head: s
         context_rule=ContextRule(driver_specific=False, shrinkage=0.3, history_s=20.0),
         trained_on=TrainedOn({"abc": "a/1"}),
     )
-    checkpoint.save(agent, tmp_path)
-    loaded = checkpoint.load(tmp_path)
+    checkpoint.save_agent(agent, tmp_path)
+    loaded = checkpoint.load_agent(tmp_path)
     assert torch.equal(chosen(loaded), chosen(agent))
     assert loaded.context_rule == agent.context_rule
     assert loaded.trained_on == agent.trained_on
@@ -67,13 +67,13 @@ def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, head: s
 def test_what_cannot_be_read_is_refused(
     tmp_path: Path, key: str, value: object, message: str
 ) -> None:
-    checkpoint.save(adaptive(NODE), tmp_path)
+    checkpoint.save_agent(adaptive(NODE), tmp_path)
     description = json.loads((tmp_path / "policy.json").read_text())
     (tmp_path / "policy.json").write_text(json.dumps(description | {key: value}))
     with pytest.raises(DataError, match=message):
-        checkpoint.load(tmp_path)
+        checkpoint.load_agent(tmp_path)
 
 
 def test_a_folder_without_a_policy_is_refused(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="holds no policy that can be read"):
-        checkpoint.load(tmp_path)
+        checkpoint.load_agent(tmp_path)

@@ -16,9 +16,9 @@ from pydantic import ValidationError
 from sklearn.linear_model import Ridge
 
 import cfx
-from cfx.core.errors import ConfigError
 from cfx.data.pairs import PairBatch
 from cfx.data.tidy import write_tidy
+from cfx.errors import ConfigError
 from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
@@ -152,8 +152,11 @@ def test_the_mean_of_the_training_drivers_stands_for_an_unseen_driver() -> None:
 
 def test_a_saved_policy_uses_the_same_driver_features(tmp_path: Path) -> None:
     policy = one_that_knows()
-    checkpoint.save(policy, tmp_path)
-    for again in (checkpoint.load(tmp_path), checkpoint.load(tmp_path).for_unseen_drivers()):
+    checkpoint.save_agent(policy, tmp_path)
+    for again in (
+        checkpoint.load_agent(tmp_path),
+        checkpoint.load_agent(tmp_path).for_unseen_drivers(),
+    ):
         now = History(
             *(torch.full((1, 5), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0))
         )

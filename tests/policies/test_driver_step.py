@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.core.errors import ConfigError, DataError
 from cfx.core.registry import create
 from cfx.data.pairs import PairBatch
+from cfx.errors import ConfigError, DataError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss

@@ -7,7 +7,7 @@ import torch
 
 from cfx.core import registry
 from cfx.core.component import validate
-from cfx.core.errors import ConfigError, PluginError
+from cfx.errors import ConfigError, PluginError
 from cfx.learners.imitation import ImitationSettings
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.w99 import W99

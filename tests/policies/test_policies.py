@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.policies.base import Policy
 from cfx.policies.features import INPUT_SETS, INPUTS, History, Scaler, token_width, tokens
 from cfx.policies.gru import GruPolicy

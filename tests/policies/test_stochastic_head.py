@@ -264,8 +264,8 @@ def test_outside_the_valid_range_scales_fade_to_what_they_are_at_first() -> None
 def test_dispersion_widens_the_noise_and_is_saved(tmp_path: Path) -> None:
     agent = adaptive(KRAUSS, stochastic=True)
     wide = replace(agent, dispersion=torch.tensor([2.0]))
-    checkpoint.save(wide, tmp_path)
-    loaded = checkpoint.load(tmp_path)
+    checkpoint.save_agent(wide, tmp_path)
+    loaded = checkpoint.load_agent(tmp_path)
     assert loaded.dispersion is not None
     assert loaded.dispersion.tolist() == [2.0]
     targets, moves = [], []
@@ -281,8 +281,8 @@ def test_dispersion_widens_the_noise_and_is_saved(tmp_path: Path) -> None:
 
 def test_a_saved_policy_draws_as_it_did(tmp_path: Path) -> None:
     agent = adaptive(KRAUSS, ("one", "two"), stochastic=True)
-    checkpoint.save(agent, tmp_path)
-    loaded = checkpoint.load(tmp_path)
+    checkpoint.save_agent(agent, tmp_path)
+    loaded = checkpoint.load_agent(tmp_path)
     network = torch.tensor([0, 1, 1])
     for seed in (None, 0):
         expected, _ = act(agent, agent.begin(network), seed)

@@ -12,7 +12,7 @@ import xarray as xr
 from arviz_stats.base.array import array_stats
 
 import cfx
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx_posteriors import nuts
 from cfx_posteriors.netcdf import NetcdfExport
 

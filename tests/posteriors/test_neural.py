@@ -12,7 +12,7 @@ from rich.text import Text
 
 import cfx
 from cfx.calibration.posterior import posterior_method
-from cfx.core.errors import NotInstalledError
+from cfx.errors import NotInstalledError
 from cfx.models.krauss import Krauss
 from cfx.results.tables import KnownParameters
 from cfx_posteriors.importance import sample

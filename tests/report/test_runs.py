@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from cfx.app.cli import main
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx_report.runs import read_runs
 from tests.report.folders import ACROSS, write_job
 

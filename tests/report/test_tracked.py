@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from cfx.core.errors import DataError, TrackingError
+from cfx.errors import DataError, TrackingError
 from cfx.results.mlflow.tracker import MlflowTracker
 from cfx_report.runs import read_runs
 from tests.report.folders import write_job

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from cfx.core.errors import TrackingError
+from cfx.errors import TrackingError
 from cfx.results.mlflow import store
 from cfx.results.mlflow.store import open_store, tracking_uri
 

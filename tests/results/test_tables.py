@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from cfx.core import registry
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx.results.table import (
     Column,
     Findings,

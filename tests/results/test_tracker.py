@@ -19,8 +19,8 @@ import pytest
 import torch
 
 from cfx.core import registry
-from cfx.core.errors import TrackingError
 from cfx.data.tidy import write_tidy
+from cfx.errors import TrackingError
 from cfx.evaluation.headline import headline
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Purpose
@@ -431,7 +431,7 @@ def saved_policy(tmp_path: Path) -> SimpleNamespace:
         dt=0.1,
         names=("all",),
     )
-    checkpoint.save(trained, tmp_path / "policy")
+    checkpoint.save_agent(trained, tmp_path / "policy")
     pairs = wavy_pairs(model, torch.tensor([[1.5, 0.1], [2.0, 0.3]]).double(), frames=60)
     write_tidy(pairs, tmp_path / "pairs.parquet")
     return SimpleNamespace(
@@ -485,7 +485,7 @@ def test_a_job_comes_back_from_its_run(
     assert (folder / "metrics.json").read_text() == "{}"
     expected = saved_policy.policy.predict_frame(saved_policy.frame)
     pd.testing.assert_frame_equal(
-        checkpoint.load(folder / "policy").predict_frame(saved_policy.frame), expected
+        checkpoint.load_agent(folder / "policy").predict_frame(saved_policy.frame), expected
     )
     for wrong, message in (
         ("nothing", "neither a job's output folder nor the id"),

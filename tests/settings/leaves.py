@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 
 from cfx.core import registry
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.results.config import JobConfig
 
 

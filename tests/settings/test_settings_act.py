@@ -17,7 +17,7 @@ import pytest
 
 import cfx
 from cfx.app.hydra_source import composed, plain
-from cfx.core.errors import CfxError
+from cfx.errors import CfxError
 from tests.golden.jobs import JOBS, SMALL
 from tests.settings.leaves import leaves, other_values, results, written
 

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx.core.errors import ParameterError
 from cfx.data.pairs import Pair, PairBatch, PairSet
+from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99

@@ -11,7 +11,7 @@ import cfx
 from cfx.app.hydra_source import composed, plain
 from cfx.app.job.run import run_job
 from cfx.core import registry
-from cfx.core.errors import ConfigError, PluginError
+from cfx.errors import ConfigError, PluginError
 from cfx.models.krauss import Krauss
 from cfx.results.config import JobConfig
 from cfx.simulation.base import Simulator

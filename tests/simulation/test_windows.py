@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cfx.core.component import validate
-from cfx.core.errors import ConfigError, DataError
 from cfx.data.pairs import PairSet
+from cfx.errors import ConfigError, DataError
 from cfx.simulation.windows import Split, Windows, WindowSettings
 from tests.drives import straight_pairs
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.core.errors import SumoError
+from cfx.errors import SumoError
 from cfx.policies.features import History
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.driver import Driver

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 import cfx_sumo
-from cfx.core.errors import DataError, ParameterError, SumoError
 from cfx.data.pairs import PairBatch
 from cfx.data.style import StyleResult, StyleSettings, measure_style
+from cfx.errors import DataError, ParameterError, SumoError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.evaluate import ComparedPairs, evaluate
 from cfx.models.krauss import Krauss
@@ -433,7 +433,7 @@ def test_what_cannot_be_driven_is_one_sentence(tmp_path: Path) -> None:
     plain = adaptive(node)
     with pytest.raises(DataError, match="SUMO alone drives"):
         Driver(plain)
-    checkpoint.save(adaptive({"name": "krauss"}, ("p1", "p2")), tmp_path / "policy")
+    checkpoint.save_agent(adaptive({"name": "krauss"}, ("p1", "p2")), tmp_path / "policy")
     with pytest.raises(
         DataError,
         match=r"has 2 networks, each for one driver \(p1, \.\.\.\), and none for unseen drivers",
@@ -602,7 +602,7 @@ def test_random_numbers_of_vehicles_are_standard_normal_and_independent() -> Non
 
 
 def test_a_network_may_be_named_behind_the_run(tmp_path: Path) -> None:
-    checkpoint.save(adaptive({"name": "krauss"}, ("p1", "p2")), tmp_path / "policy")
+    checkpoint.save_agent(adaptive({"name": "krauss"}, ("p1", "p2")), tmp_path / "policy")
     fleet = Fleet.load({"calm": f"{tmp_path}#p2"})
     road = platoon(1)
     fleet.step(road)
@@ -618,7 +618,7 @@ def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, model in (("calm", "krauss"), ("hasty", "w99")):
-        checkpoint.save(adaptive({"name": model}), tmp_path / name / "policy")
+        checkpoint.save_agent(adaptive({"name": model}), tmp_path / name / "policy")
     fleet = Fleet.load(
         {"calm": tmp_path / "calm", "normal": tmp_path / "calm", "hasty": tmp_path / "hasty"}
     )
@@ -720,7 +720,7 @@ def test_in_sumo_a_policy_drives_as_in_memory(
         residual=residual,
         driver_features=driver_features,
     )
-    checkpoint.save(policy, tmp_path / "policy")
+    checkpoint.save_agent(policy, tmp_path / "policy")
     first, own = torch.tensor([0, 215, 100, frames - 100]), torch.arange(4)
     simulator, base = MemoryStepper(model, 0.1), model.space.defaults().expand(4, -1)
     loops = {

@@ -18,7 +18,7 @@ import pytest
 import cfx
 from cfx.app.hydra_source import composed, plain
 from cfx.app.job.run import run_job
-from cfx.core.errors import CfxError, ConfigError, SumoError
+from cfx.errors import CfxError, ConfigError, SumoError
 from cfx.results.config import JobConfig
 from cfx_sumo import installed
 from tests.scripts import ENVIRONMENT

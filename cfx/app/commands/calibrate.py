@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cfx.core.command import Command
-from cfx.core.errors import ConfigError
 from cfx.core.files import path_override
+from cfx.errors import ConfigError
 
 _CHOSEN = {"policy": "fixed", "protocol": "within_driver"}
 """What a calibration chooses in place of the usual options; the command line may choose others."""

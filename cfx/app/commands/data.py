@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from cfx.core.command import Command
-from cfx.core.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError
 
 
 class DataCommand(Command):

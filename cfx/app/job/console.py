@@ -14,7 +14,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cfx.calibration.identifiability import NEAR, flat_for
-from cfx.core.errors import without_passwords
+from cfx.errors import without_passwords
 from cfx.evaluation.demo import PAGE
 from cfx.evaluation.headline import headline
 from cfx.evaluation.metrics.base import MetricInfo, key_of

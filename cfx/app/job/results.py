@@ -16,13 +16,13 @@ import yaml
 
 from cfx.app.overrides import command_of
 from cfx.core import registry
-from cfx.core.errors import ConfigError, DataError, OutputError, listed
 from cfx.core.files import atomic_write, remove_leftovers, write_json
 from cfx.core.guest import visit
 from cfx.core.job_folder import examine, parse_yaml, read_metrics
 from cfx.core.storage import RemoteFolder
 from cfx.data.style import StyleResult
 from cfx.data.tidy import write_tidy
+from cfx.errors import ConfigError, DataError, OutputError, listed
 from cfx.evaluation.headline import headline, improvement_key
 from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.statistics import STATISTICS
@@ -104,7 +104,7 @@ def write_job(
         metrics = measured(findings, tables)
         if tell is not None:
             tell(metrics, tables)
-        checkpoint.save(result.policy, folder / "policy")
+        checkpoint.save_agent(result.policy, folder / "policy")
         figures: list[Path] = []
         if config.figures.enabled:
             figures = _write_figures(folder, config, findings, tables, metrics)
@@ -491,5 +491,5 @@ def load(folder_or_run: str | Path) -> JobResult:
     metrics = read_metrics(folder / "metrics.json")
     pairs = read_tables(folder, "pairs").get("pairs", pd.DataFrame())
     figures = tuple(sorted((folder / "figures").glob("*.*")))
-    policy = checkpoint.load(folder / "policy")
+    policy = checkpoint.load_agent(folder / "policy")
     return JobResult(metrics, pairs, policy, figures, folder)

@@ -25,7 +25,6 @@ from cfx.calibration.shards import Solver
 from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.core.engine import Engine
-from cfx.core.errors import ConfigError, PluginError
 from cfx.core.memory import require_memory
 from cfx.core.storage import is_url
 from cfx.core.threads import limit_cores, set_threads
@@ -33,6 +32,7 @@ from cfx.data.base import Dataset
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.signals import COARSE_S
 from cfx.data.style import StyleResult, measure_style, select_cluster
+from cfx.errors import ConfigError, PluginError
 from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.base import MetricSet
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult

@@ -170,8 +170,8 @@ class Sweep:
 
     def _close_runs(self) -> tuple[str, ...]:
         """Closes runs that killed jobs left open; returns lines that lead to them."""
-        from cfx.core.errors import TrackingError
         from cfx.core.registry import names
+        from cfx.errors import TrackingError
         from cfx.results.tracker import tracking_named
 
         name = str(self.tracking.get("name"))

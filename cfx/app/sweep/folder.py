@@ -24,9 +24,9 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from omegaconf import DictConfig, OmegaConf
 
 from cfx.core.component import content_key
-from cfx.core.errors import CfxError, ConfigError, DataError
 from cfx.core.files import lock_for, write_json
 from cfx.core.storage import is_url, state
+from cfx.errors import CfxError, ConfigError, DataError
 
 log = logging.getLogger(__name__)
 

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 
 from cfx.app.sweep.folder import JobStatus, metrics_of
 from cfx.core.console import blank_table
-from cfx.core.errors import DataError
 from cfx.core.files import atomic_write
+from cfx.errors import DataError
 from cfx.evaluation.headline import main_comparison, ratio_of_means
 from cfx.figures.text import short_label
 

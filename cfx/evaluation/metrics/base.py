@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.distributions import OWN
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 
 if TYPE_CHECKING:
     from torch import Tensor

@@ -23,7 +23,7 @@ from cfx.evaluation.tables import values_of
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
 from cfx.policies.agent import Agent
 from cfx.policies.context import ContextRule, ExpectedError
-from cfx.policies.core import ALL
+from cfx.policies.core import ANY_DRIVER
 from cfx.policies.heads.offset import shrunk
 from cfx.simulation.windows import Split
 
@@ -242,7 +242,7 @@ class AcrossDrivers(Protocol):
     ) -> tuple[Agent, TrainingResult]:
         """Trains a network for each row of `members`, `(K + 1, P)`, on full trajectories."""
         s = self.settings
-        names = (*(f"fold {number}" for number in range(len(members) - 1)), ALL)
+        names = (*(f"fold {number}" for number in range(len(members) - 1)), ANY_DRIVER)
         if not context.policy.trainable:
             training_result = context.untrained(context.policy, found.start)
             policy = context.ready(context.policy, training_result, names)

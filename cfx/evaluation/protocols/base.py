@@ -19,10 +19,10 @@ from cfx.calibration.objectives import Objective
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.engine import Engine
-from cfx.core.errors import DataError, PluginError
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import LearnedFrom, PairBatch, PairSet
 from cfx.data.style import StyleResult
+from cfx.errors import DataError, PluginError
 from cfx.evaluation.closed_loop import (
     ClosedLoop,
     Followers,

@@ -14,9 +14,9 @@ import torch
 from pydantic import Field
 
 from cfx.core.component import Settings
-from cfx.core.errors import DataError
 from cfx.core.files import FilePath
 from cfx.data.pairs import LearnedFrom, PairSet
+from cfx.errors import DataError
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings, Trained
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.protocols.held_out import HeldOut
@@ -51,7 +51,7 @@ class FinishedPolicy:
                 for.
         """
         try:
-            return checkpoint.load(self.run / "policy").for_unseen_drivers()
+            return checkpoint.load_agent(self.run / "policy").for_unseen_drivers()
         except DataError as error:
             raise DataError(f"protocol.run={self.run}: {error}") from None
 

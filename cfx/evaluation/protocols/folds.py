@@ -20,8 +20,8 @@ from scipy.sparse.csgraph import connected_components
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
-from cfx.core.errors import DataError, listed
 from cfx.data.pairs import Pair, PairSet
+from cfx.errors import DataError, listed
 
 log = logging.getLogger(__name__)
 

@@ -18,7 +18,7 @@ from cfx.evaluation.result import Platoon
 from cfx.learners.base import TrainingPairs
 from cfx.policies.agent import Agent
 from cfx.policies.constant import DefaultPolicy, FixedPolicy
-from cfx.policies.core import ALL, group_by
+from cfx.policies.core import ANY_DRIVER, group_by
 from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)
@@ -94,7 +94,7 @@ class WithinDriver(Protocol):
         """Returns which network learns from each pair `(P,)`, and the networks' names."""
         pairs, device = context.pairs, context.batch.lengths.device
         if context.policy.trainable and self.settings.networks == "all":
-            network, names = group_by([ALL] * len(pairs))
+            network, names = group_by([ANY_DRIVER] * len(pairs))
             return network.to(device), names
         network = torch.arange(len(pairs), device=device)
         return network, tuple(pair.pair_id for pair in pairs)

@@ -24,8 +24,8 @@ from torch import Tensor
 
 from cfx.core import registry
 from cfx.core.component import Settings
-from cfx.core.errors import ConfigError, DataError
 from cfx.core.progress import Task
+from cfx.errors import ConfigError, DataError
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult, learned_range
 from cfx.learners.curves import warn_of_nothing_learned
 from cfx.learners.rollout.dataset import RolloutDataset, time_gaps
@@ -207,7 +207,7 @@ def start_policy(start: str) -> Agent:
     place, _, name = start.partition("#")
     folder = folder_of_ready_made(place) if is_ready_made(place) else Path(place).expanduser()
     try:
-        agent = saved.load(folder / "policy")
+        agent = saved.load_agent(folder / "policy")
         if not name:
             return agent.for_unseen_drivers()
         if name not in agent.names:

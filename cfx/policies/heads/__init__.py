@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import cast
 
 from cfx.core import registry
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 from cfx.policies.heads.base import ParameterHead
 
 

@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from cfx.core.errors import DataError, nearest
+from cfx.errors import DataError, nearest
 
 SCHEME = "cfx://"
 

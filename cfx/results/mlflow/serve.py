@@ -17,7 +17,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
-from cfx.core.errors import ConfigError, TrackingError
+from cfx.errors import ConfigError, TrackingError
 from cfx.evaluation.headline import PERCENT, RESULT, SPEED_ERROR
 
 if TYPE_CHECKING:

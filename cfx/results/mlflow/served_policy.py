@@ -22,7 +22,7 @@ class ServedPolicy(PythonModel):
     def load_context(self, context: PythonModelContext) -> None:
         from cfx.policies import checkpoint
 
-        self._policy = checkpoint.load(context.artifacts["policy"])
+        self._policy = checkpoint.load_agent(context.artifacts["policy"])
 
     def predict(
         self,

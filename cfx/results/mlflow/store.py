@@ -22,8 +22,8 @@ from typing import TYPE_CHECKING, Any
 
 from filelock import BaseFileLock, Timeout
 
-from cfx.core.errors import TrackingError
 from cfx.core.files import lock_for
+from cfx.errors import TrackingError
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient

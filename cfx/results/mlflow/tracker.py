@@ -20,8 +20,8 @@ from urllib.parse import quote, urlencode
 import numpy as np
 import pandas as pd
 
-from cfx.core.errors import CfxError, TrackingError
 from cfx.data.pairs import SIGNALS, PairSet
+from cfx.errors import CfxError, TrackingError
 from cfx.evaluation.headline import RESULT, fitted_errors, headline
 from cfx.evaluation.result import Purpose
 from cfx.learners.curves import over_networks
@@ -394,7 +394,7 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
     cut = {name: getattr(first, name)[:length] for name in SIGNALS}
     frame = frame_of(PairSet((replace(first, truth={}, truth_model="", **cut),), pairs.source))
     try:
-        answer = checkpoint.load(folder).predict_frame(frame)
+        answer = checkpoint.load_agent(folder).predict_frame(frame)
     except CfxError as error:
         log.info("The policy has no input example in MLflow: %s", error)
         return {}

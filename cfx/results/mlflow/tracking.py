@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfx.core.errors import TrackingError
+from cfx.errors import TrackingError
 from cfx.results.mlflow import store
 from cfx.results.tracker import Origin, Tracker, Tracking
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 import cfx
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx_community.optimizers.cma_es import CmaOptimizer
 from cfx_contracts import check_contract
 from cfx_contracts.optimizers import Problems

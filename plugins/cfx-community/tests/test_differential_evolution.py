@@ -8,7 +8,7 @@ import torch
 from scipy.optimize import differential_evolution
 
 import cfx
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx_community.optimizers.differential_evolution import DifferentialEvolution
 from cfx_contracts import check_contract
 from cfx_contracts.optimizers import Problems

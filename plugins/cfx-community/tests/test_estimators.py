@@ -15,8 +15,8 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.gradient_search import GradientSearch
 from cfx.calibration.shards import Solver
-from cfx.core.errors import ConfigError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.errors import ConfigError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.forecasts import Origins
 from cfx.models.base import DrivingModel
@@ -296,9 +296,9 @@ def test_an_estimator_is_saved_and_loaded(name: str, tmp_path: Path) -> None:
         core=AgentCore(agent.policy, agent.network, agent.scaler, head),
         policy_node={"name": name, **policy.settings.model_dump(), "residual": True},
     )
-    checkpoint.save(agent, tmp_path)
+    checkpoint.save_agent(agent, tmp_path)
     speeds = []
-    for one in (agent, checkpoint.load(tmp_path)):
+    for one in (agent, checkpoint.load_agent(tmp_path)):
         loop = simulate_closed_loop(
             MemoryStepper(Krauss(), 0.1),
             one,

@@ -12,7 +12,7 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Follower, Leader, Start
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.simulation.rollout import simulate
 from cfx_community.models.gipps import Gipps
 from cfx_community.models.gipps_delay import GippsDelay

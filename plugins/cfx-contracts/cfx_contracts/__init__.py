@@ -21,7 +21,7 @@ from typing import Any
 
 from cfx.core import registry
 from cfx.core.contract import Check, violations
-from cfx.core.errors import PluginError, nearest
+from cfx.errors import PluginError, nearest
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,8 @@ from cfx.core.component import API_VERSION
 from cfx.core.console import blank_table, console_logging, put
 from cfx.core.contract import violations
 from cfx.core.distributions import OWN
-from cfx.core.errors import CfxError, ConfigError, NotInstalledError, in_words
 from cfx.core.progress import Task
+from cfx.errors import CfxError, ConfigError, NotInstalledError, in_words
 from cfx_contracts import contract_for
 
 

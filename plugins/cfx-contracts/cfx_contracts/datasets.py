@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from cfx.core.contract import once
-from cfx.core.errors import CfxError, DataError
 from cfx.data.base import Dataset, DatasetSettings
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.errors import CfxError, DataError
 from cfx_contracts import contract_of
 
 

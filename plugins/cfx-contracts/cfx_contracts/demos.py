@@ -11,8 +11,8 @@ from functools import cache
 from pathlib import Path
 
 from cfx.core.contract import NotApplicable
-from cfx.core.errors import CfxError, NotInstalledError
 from cfx.data.pairs import PairSet
+from cfx.errors import CfxError, NotInstalledError
 from cfx.evaluation.demo import Demo
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.protocols.within_driver import WithinDriver
@@ -46,7 +46,7 @@ def write_returns_the_files_in_its_folder(demo: Demo) -> None:
     except CfxError as error:
         raise NotApplicable(f"it cannot show the job of this contract: {error}") from error
     with tempfile.TemporaryDirectory(prefix="cfx-demo-") as job:
-        checkpoint.save(result.policy, Path(job, "policy"))
+        checkpoint.save_agent(result.policy, Path(job, "policy"))
         folder = Path(job, "demo")
         folder.mkdir()
         protocol = {"name": "within_driver"}

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import closing
 
 from cfx.core.engine import Engine, Report
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx_contracts import contract_of
 
 SHARDS = 5

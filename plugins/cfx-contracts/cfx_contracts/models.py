@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from cfx.core.contract import NotApplicable, expect_close
-from cfx.core.errors import CfxError
+from cfx.errors import CfxError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.contract import (
     DRIVES,

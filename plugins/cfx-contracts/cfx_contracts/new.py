@@ -20,7 +20,7 @@ from cfx.core import registry
 from cfx.core.command import Command
 from cfx.core.component import API_VERSION
 from cfx.core.distributions import OWN
-from cfx.core.errors import ConfigError, OutputError, PluginError
+from cfx.errors import ConfigError, OutputError, PluginError
 
 _TEMPLATE = Path(__file__).parent / "template"
 

@@ -16,7 +16,7 @@ from torch import Tensor
 from cfx.calibration.contract import FIRST_OF_OPTIMIZERS
 from cfx.calibration.optimizers import CandidateLosses, Optimizer, Solution
 from cfx.core.contract import NotApplicable, expect_close
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 from cfx_contracts import contract_of
 
 Function = Callable[[Tensor, Tensor], Tensor]

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from cfx.core.contract import expect_close
-from cfx.core.errors import CfxError, ConfigError
+from cfx.errors import CfxError, ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
 from cfx.simulation.base import Simulator, Stepper

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 import cfx_drivers.gym
 from cfx import PairBatch, PairSet
-from cfx.core.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.models.krauss import Krauss
 from cfx.simulation.rollout import MemoryStepper

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from cfx.app.cli import main
-from cfx.policies.checkpoint import save
+from cfx.policies.checkpoint import save_agent
 from cfx.policies.driver_step import DriverStep, Motion
 from tests.agents import adaptive
 
@@ -23,7 +23,7 @@ STEPS = 60
 @pytest.fixture(scope="module")
 def unit(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("unit") / "job"
-    save(adaptive({"name": "idm"}), folder / "policy")
+    save_agent(adaptive({"name": "idm"}), folder / "policy")
     assert main(["export", str(folder), "--to", "fmi"]) == 0
     return folder / "driver.fmu"
 

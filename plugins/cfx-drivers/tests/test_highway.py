@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.policies.driver_step import Motion
 from cfx_drivers.gym.drivers import driver_step
 

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.app.cli import main
-from cfx.core.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError
 from cfx.policies.base import PolicyNetwork
-from cfx.policies.checkpoint import load, save
+from cfx.policies.checkpoint import load_agent, save_agent
 from cfx.policies.core import AgentCore
 from cfx.policies.driver_step import DriverStep, Motion
 from cfx.results.tracker import folder_of
@@ -71,7 +71,7 @@ def test_a_stochastic_driver_drives_the_example_as_cfx_does(
     )
     assert done.returncode == 0, done.stderr
     found = np.array([line.split(",") for line in done.stdout.split()[1:]], dtype=float)[:, 1:]
-    step = DriverStep(load(folder_of("cfx://i80-idm-stochastic") / "policy"))
+    step = DriverStep(load_agent(folder_of("cfx://i80-idm-stochastic") / "policy"))
     expected = driven(step)
     # Rounding in single precision, in which networks are, multiplies from vehicle to vehicle.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
@@ -117,7 +117,7 @@ def test_the_example_in_cpp_drives_as_the_one_in_python(tmp_path: Path) -> None:
 
 def test_one_of_several_networks_is_named(tmp_path: Path) -> None:
     agent = adaptive({"name": "idm"}, ("one", "two"))
-    save(agent, tmp_path / "policy")
+    save_agent(agent, tmp_path / "policy")
     with pytest.raises(DataError, match="2 networks"):
         OnnxExport().write(str(tmp_path), None)
     with pytest.raises(DataError, match="no network 'three'; it has one, two"):

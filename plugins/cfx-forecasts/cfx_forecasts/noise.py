@@ -10,7 +10,7 @@ import logging
 import torch
 from torch import Tensor
 
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.models.composed import TIME

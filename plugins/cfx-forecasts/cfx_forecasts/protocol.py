@@ -14,7 +14,7 @@ from pydantic import AfterValidator, Field
 from torch import Tensor
 
 from cfx.core.component import Settings
-from cfx.core.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError
 from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.forecasts import (
     LeaderFuture,

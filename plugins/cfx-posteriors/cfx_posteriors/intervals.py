@@ -21,9 +21,9 @@ from cfx.calibration.posterior import DriverPosteriors, PosteriorMethod
 from cfx.calibration.settings import LEVEL, CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.core.distributions import install_line
-from cfx.core.errors import NotInstalledError
 from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
+from cfx.errors import NotInstalledError
 from cfx.simulation.trajectory import Segments
 from cfx_posteriors.density import ParameterPrior, Posterior
 from cfx_posteriors.fan import Fan, fan_of

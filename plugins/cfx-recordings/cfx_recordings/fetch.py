@@ -26,9 +26,9 @@ from urllib.parse import urlsplit
 
 from filelock import FileLock, Timeout
 
-from cfx.core.errors import ConfigError, DataError, OutputError
 from cfx.core.files import atomic_write
 from cfx.core.progress import Task
+from cfx.errors import ConfigError, DataError, OutputError
 from cfx_recordings.ngsim import MOTORWAY
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from cfx import PairSet, Settings
-from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, magic, stem
+from cfx.errors import DataError
 from cfx_recordings.series import Series, pairs_of
 
 _NPY, _ZIP, _MATLAB, _HDF = b"\x93NUM", b"PK\x03\x04", b"MATL", b"\x89HDF"

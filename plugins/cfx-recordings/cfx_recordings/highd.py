@@ -12,18 +12,18 @@ import numpy as np
 from pydantic import Field
 
 from cfx import PairSet, Settings
-from cfx.core.errors import DataError
 from cfx.data.base import Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints
 from cfx.data.sites import with_sites
-from cfx.data.table import Column, Layout, Table, read_table
+from cfx.data.table import FileColumn, Layout, Table, read_table
 from cfx.data.tracks import Tracks, extract_pairs
+from cfx.errors import DataError
 
 _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
 
 
-def _count(name: str) -> Column:
-    return Column(name, whole=True, least=0, wrong="is no whole number from 0 on")
+def _count(name: str) -> FileColumn:
+    return FileColumn(name, whole=True, least=0, wrong="is no whole number from 0 on")
 
 
 _TRACK_COLUMNS = Layout(
@@ -31,23 +31,27 @@ _TRACK_COLUMNS = Layout(
     (
         _count("frame"),
         _count("id"),
-        Column("x", "m"),
-        Column("width", "m", above=0, wrong="is no vehicle length"),
-        Column("xVelocity", "m/s"),
-        Column("xAcceleration", "m/s2"),
+        FileColumn("x", "m"),
+        FileColumn("width", "m", above=0, wrong="is no vehicle length"),
+        FileColumn("xVelocity", "m/s"),
+        FileColumn("xAcceleration", "m/s2"),
         _count("precedingId"),
         _count("laneId"),
     ),
 )
 _VEHICLE_COLUMNS = Layout(
     "highD's vehicles",
-    (Column("id"), Column("drivingDirection"), Column("class", is_name=True, may_be_empty=True)),
+    (
+        FileColumn("id"),
+        FileColumn("drivingDirection"),
+        FileColumn("class", is_name=True, may_be_empty=True),
+    ),
 )
 _RECORDING_COLUMNS = Layout(
     "highD's recordings",
     (
-        Column("frameRate", "1/s", above=0, wrong="is no frame rate"),
-        Column("locationId", is_name=True, needed=False, may_be_empty=True),
+        FileColumn("frameRate", "1/s", above=0, wrong="is no frame rate"),
+        FileColumn("locationId", is_name=True, needed=False, may_be_empty=True),
     ),
 )
 

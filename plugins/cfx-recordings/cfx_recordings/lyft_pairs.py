@@ -16,9 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from cfx import PairSet, Settings
-from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
+from cfx.errors import DataError
 from cfx_recordings.series import Series, frames_at, pairs_of
 
 DT = 0.1

@@ -20,12 +20,12 @@ import pandas as pd
 from pydantic import Field
 
 from cfx.core.component import Settings
-from cfx.core.errors import DataError, listed, nearest
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
 from cfx.data.pairs import Dropped, PairSet
-from cfx.data.table import Column, Labels, Layout, Table, read_table
+from cfx.data.table import FileColumn, Layout, NameColumn, Table, read_table
 from cfx.data.tracks import Tracks, changes, extract_pairs
+from cfx.errors import DataError, listed, nearest
 
 FOOT = 0.3048
 """Metres; exact by definition."""
@@ -109,8 +109,8 @@ def _plain(name: str) -> str:
     return _SPELLINGS.get(plain, plain)
 
 
-def _count(name: str) -> Column:
-    return Column(name, whole=True, least=0, wrong="is no whole number; correct it")
+def _count(name: str) -> FileColumn:
+    return FileColumn(name, whole=True, least=0, wrong="is no whole number; correct it")
 
 
 _LAYOUT = Layout(
@@ -118,14 +118,14 @@ _LAYOUT = Layout(
     columns=(
         _count("Vehicle_ID"),
         _count("Frame_ID"),
-        Column("Local_Y", "ft"),
-        Column("v_Length", "ft", above=0, wrong="is no vehicle length; correct it"),
-        Column("v_Vel", "ft/s", least=0, wrong="is negative: a speed cannot be; correct it"),
-        Column("v_Acc", "ft/s2"),
+        FileColumn("Local_Y", "ft"),
+        FileColumn("v_Length", "ft", above=0, wrong="is no vehicle length; correct it"),
+        FileColumn("v_Vel", "ft/s", least=0, wrong="is negative: a speed cannot be; correct it"),
+        FileColumn("v_Acc", "ft/s2"),
         _count("Lane_ID"),
         _count("Preceding"),
-        Column(_CLOCK, "ms", needed=False),
-        Column(_LOCATION, is_name=True, needed=False),
+        FileColumn(_CLOCK, "ms", needed=False),
+        FileColumn(_LOCATION, is_name=True, needed=False),
     ),
     elsewhere={"pairid": "This is the tidy pair layout: use data=tidy."},
     headerless={18: MOTORWAY, 24: (*_BEFORE_ZONES, *_ZONES, *_AFTER_ZONES)},
@@ -205,7 +205,7 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     """
     table = read_table(path, _LAYOUT)
     numbers, count = table.numbers, len(table)
-    where = table.labels.get(_LOCATION) or Labels(np.zeros(count, np.int64), [stem(path)])
+    where = table.labels.get(_LOCATION) or NameColumn(np.zeros(count, np.int64), [stem(path)])
     dropped = []
     row = np.arange(count)
     if location is not None:
@@ -256,7 +256,7 @@ def _rows(
     )
 
 
-def _location_code(table: Table, where: Labels, location: str) -> int:
+def _location_code(table: Table, where: NameColumn, location: str) -> int:
     """Returns the index of a location in `where.names`."""
     for code, name in enumerate(where.names):
         if name.lower() == location.lower():

@@ -14,13 +14,13 @@ from typing import ClassVar, NamedTuple, TypeVar
 import numpy as np
 
 from cfx import PairSet, Settings
-from cfx.core.errors import DataError, listed
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, beginning, stem
-from cfx.data.table import Column, Labels, Layout, Table, read_table
+from cfx.data.table import FileColumn, Layout, NameColumn, Table, read_table
+from cfx.errors import DataError, listed
 from cfx_recordings.series import Series, frames_at, pairs_of
 
-_Column = TypeVar("_Column", Floats, Labels)
+_Column = TypeVar("_Column", Floats, NameColumn)
 
 DT = 0.1
 """Seconds between two rows of every campaign."""
@@ -39,10 +39,10 @@ _TYPE_OF_FLAG = {"0": _HUMAN, "1": _ACC}
 _LAYOUT = Layout(
     "OpenACC",
     (
-        Column("Time", "s"),
-        Column(r"Speed\d+", "m/s", many=True, needed=False, may_be_empty=True),
-        Column(r"IVS\d+", "m", many=True, needed=False, may_be_empty=True),
-        Column(r"Driver\d+", is_name=True, many=True, needed=False, may_be_empty=True),
+        FileColumn("Time", "s"),
+        FileColumn(r"Speed\d+", "m/s", many=True, needed=False, may_be_empty=True),
+        FileColumn(r"IVS\d+", "m", many=True, needed=False, may_be_empty=True),
+        FileColumn(r"Driver\d+", is_name=True, many=True, needed=False, may_be_empty=True),
     ),
     above=_LINES,
 )
@@ -112,7 +112,7 @@ class _File(NamedTuple):
     frame: Ints
     speeds: Mapping[int, Floats]
     gaps: Mapping[int, Floats]
-    drivers: Mapping[int, Labels]
+    drivers: Mapping[int, NameColumn]
 
 
 def _read(path: Path) -> _File:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from cfx.core.errors import DataError
 from cfx.data.files import Floats, Ints
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.tracks import (
@@ -22,6 +21,7 @@ from cfx.data.tracks import (
     summed,
     unique_name,
 )
+from cfx.errors import DataError
 
 _STEP_ROOM = 0.05
 """How far the typical step between times may be from the layout's, as a share of it."""

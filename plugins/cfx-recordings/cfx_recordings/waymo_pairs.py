@@ -14,11 +14,11 @@ from typing import ClassVar
 import numpy as np
 
 from cfx import PairSet, Settings
-from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
-from cfx.data.table import Column, Layout, Table, read_table
+from cfx.data.table import FileColumn, Layout, Table, read_table
 from cfx.data.tracks import changes
+from cfx.errors import DataError
 from cfx_recordings.series import Series, frames_at, pairs_of
 
 DT = 0.1
@@ -30,19 +30,19 @@ AUTOMATED = 0
 _TIME, _LENGTH = "local_time", "length"
 
 
-def _motion(name: str, earlier: str, unit: str) -> Column:
-    return Column(name, unit, spellings=(earlier,), may_be_empty=True)
+def _motion(name: str, earlier: str, unit: str) -> FileColumn:
+    return FileColumn(name, unit, spellings=(earlier,), may_be_empty=True)
 
 
 _LAYOUT = Layout(
     "the Waymo pairs",
     (
-        Column("segment_id"),
-        Column("local_veh_id"),
-        Column("follower_id"),
-        Column("leader_id"),
-        Column(_TIME, "s"),
-        Column(_LENGTH, "m", above=0, wrong="is no vehicle length"),
+        FileColumn("segment_id"),
+        FileColumn("local_veh_id"),
+        FileColumn("follower_id"),
+        FileColumn("leader_id"),
+        FileColumn(_TIME, "s"),
+        FileColumn(_LENGTH, "m", above=0, wrong="is no vehicle length"),
         _motion("filter_pos", "processed_position", "m"),
         _motion("filter_speed", "processed_speed", "m/s"),
         _motion("filter_accer", "processed_accer", "m/s2"),

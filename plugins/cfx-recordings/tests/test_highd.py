@@ -10,7 +10,7 @@ import pytest
 
 import cfx
 from cfx.app.cli import main
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx_contracts import check_contract
 from cfx_recordings.highd import HighdDataset
 

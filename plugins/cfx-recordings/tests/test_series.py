@@ -16,7 +16,7 @@ from scipy.io import savemat
 
 import cfx
 from cfx.app.cli import main
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx_contracts import check_contract
 from cfx_recordings.followernet import FollowernetDataset
 from cfx_recordings.lyft_pairs import LyftPairsDataset

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from cfx.core.command import Command
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 
 NAME = "report.html"
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.evaluation.result import Purpose
 from cfx.figures.job import Job
 from cfx.figures.text import common_prefix

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from cfx.core.command import Command
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 
 if TYPE_CHECKING:
     from cfx.figures.job import Job
@@ -164,7 +164,7 @@ def _words(text: str, option: str, known: Sequence[str]) -> tuple[str, ...]:
     Raises:
         ConfigError: one is not known.
     """
-    from cfx.core.errors import nearest
+    from cfx.errors import nearest
 
     words = tuple(word.strip() for word in text.split(",") if word.strip())
     for word in words or ("",):

@@ -10,9 +10,9 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from cfx.core.errors import DataError, without_passwords
 from cfx.core.job_folder import optional, read_json
 from cfx.core.storage import is_url, local_folder
+from cfx.errors import DataError, without_passwords
 from cfx.figures.job import Job, read_job
 from cfx.results.tracker import Origin, tracking_of_run
 from cfx_report.jobs import Runs, Unfinished

@@ -17,11 +17,11 @@ from torch import Tensor
 from cfx import DrivingModel
 from cfx.calibration.identifiability import COLUMN
 from cfx.core.command import ExportFormat
-from cfx.core.errors import ConfigError, DataError, listed
 from cfx.core.files import write_output
 from cfx.core.job_folder import examine, parse_json, parse_yaml
 from cfx.core.registry import create
 from cfx.data.signals import COARSE_S
+from cfx.errors import ConfigError, DataError, listed
 from cfx.models.vtype import InSumo, VType
 from cfx.results.tracker import folder_of
 from cfx_sumo.limits import lost_limits

@@ -15,11 +15,11 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.core.errors import DataError
 from cfx.data.files import FileStart, Floats, Ints, open_text
 from cfx.data.pairs import Dropped
-from cfx.data.table import Column, Layout, Table, read_table
+from cfx.data.table import FileColumn, Layout, Table, read_table
 from cfx.data.tracks import counted
+from cfx.errors import DataError
 
 _BLOCK = 1 << 20
 
@@ -192,20 +192,20 @@ def _plain(name: str) -> str:
 _LAYOUT = Layout(
     "SUMO's FCD output",
     (
-        Column("time", "s"),
+        FileColumn("time", "s"),
         # A time step without vehicles is a row with nothing but the time; a person is in no lane.
-        Column("id", is_name=True, may_be_empty=True),
-        Column("lane", is_name=True, may_be_empty=True),
-        Column("type", is_name=True, may_be_empty=True, needed=False),
-        Column("leaderID", is_name=True, may_be_empty=True, needed=False),
-        Column("speed", "m/s", may_be_empty=True),
-        Column("pos", "m", may_be_empty=True),
-        Column("acceleration", "m/s2", may_be_empty=True, needed=False),
-        Column("leaderGap", "m", may_be_empty=True, needed=False),
-        Column("posLat", "m", may_be_empty=True, needed=False),
-        Column("x", "m", may_be_empty=True, needed=False),
-        Column("y", "m", may_be_empty=True, needed=False),
-        Column("angle", "degrees", may_be_empty=True, needed=False),
+        FileColumn("id", is_name=True, may_be_empty=True),
+        FileColumn("lane", is_name=True, may_be_empty=True),
+        FileColumn("type", is_name=True, may_be_empty=True, needed=False),
+        FileColumn("leaderID", is_name=True, may_be_empty=True, needed=False),
+        FileColumn("speed", "m/s", may_be_empty=True),
+        FileColumn("pos", "m", may_be_empty=True),
+        FileColumn("acceleration", "m/s2", may_be_empty=True, needed=False),
+        FileColumn("leaderGap", "m", may_be_empty=True, needed=False),
+        FileColumn("posLat", "m", may_be_empty=True, needed=False),
+        FileColumn("x", "m", may_be_empty=True, needed=False),
+        FileColumn("y", "m", may_be_empty=True, needed=False),
+        FileColumn("angle", "degrees", may_be_empty=True, needed=False),
     ),
     keys={"vehicle": "id"},
     separators=(",", ";", "\t", "|"),

@@ -9,7 +9,7 @@ import importlib.metadata
 import re
 
 from cfx.core.distributions import install_line
-from cfx.core.errors import NotInstalledError, SumoError
+from cfx.errors import NotInstalledError, SumoError
 
 DISTRIBUTION = "cfx-sumo"
 """What brings SUMO."""

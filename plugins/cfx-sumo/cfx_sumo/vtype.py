@@ -10,8 +10,8 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx import DrivingModel, Follower, Leader, ModelSettings, ParameterSpace, Settings
-from cfx.core.errors import ConfigError
 from cfx.core.parameters import ParameterOverride
+from cfx.errors import ConfigError
 from cfx.models.vtype import VType
 
 _UNITS = {

@@ -9,8 +9,8 @@ import pandas as pd
 import pytest
 
 import cfx
-from cfx.core.errors import ConfigError, DataError, SumoError
-from cfx.policies.checkpoint import save
+from cfx.errors import ConfigError, DataError, SumoError
+from cfx.policies.checkpoint import save_agent
 from cfx_sumo.demo import motorway
 from cfx_sumo.demo.demo import SumoDemo
 from cfx_sumo.demo.motorway import SHIPPED, find_netconvert, read_motorway
@@ -224,7 +224,7 @@ def test_what_sumo_refuses_is_one_sentence() -> None:
         "pairs": [pair],
     }
     with tempfile.TemporaryDirectory() as folder:
-        save(adaptive({"name": "krauss"}), Path(folder))
+        save_agent(adaptive({"name": "krauss"}), Path(folder))
         with pytest.raises(
             SumoError,
             match=r"^SUMO lost a vehicle or refuses one \(The edge 'nowhere' within the route 'from0'",

@@ -12,8 +12,8 @@ import pytest
 
 from cfx.app.cli import main
 from cfx.core.distributions import install_line
-from cfx.core.errors import ConfigError
-from cfx.policies.checkpoint import save
+from cfx.errors import ConfigError
+from cfx.policies.checkpoint import save_agent
 from cfx_sumo.demo.motorway import SHIPPED
 from cfx_sumo.drive.run import Collision, ScenarioRun, Tally, parse_drivers, report
 from tests.agents import adaptive
@@ -52,7 +52,7 @@ def scenario(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / f"{name}.sumocfg").write_text(CONFIGURATION.format(net=SHIPPED, **values))
     (folder / "torn.sumocfg").write_text("<configuration><input><net-file")
     for name, model in (("calm", "krauss"), ("hasty", "w99")):
-        save(adaptive({"name": model}), folder / name / "policy")
+        save_agent(adaptive({"name": model}), folder / name / "policy")
     return folder
 
 
@@ -99,7 +99,7 @@ def test_what_cannot_be_driven_is_one_sentence_and_leaves_no_file(
         sys.modules["pyarrow"] = None
         import json
         from pathlib import Path
-        from cfx.core.errors import CfxError
+        from cfx.errors import CfxError
         from cfx_sumo.drive.run import run_scenario
         said = []
         for name, kinds in (("motorway", ["clam"]), ("motorway", ["calm", "ghost"]),
@@ -184,7 +184,7 @@ def test_a_distribution_is_driven_and_far_positions_are_exact(scenario: Path, li
         sys.modules["pyarrow"] = None
         import csv, json, os
         from pathlib import Path
-        from cfx.core.errors import CfxError
+        from cfx.errors import CfxError
         from cfx_sumo.drive.run import run_scenario
         mixed = Path("mixed.sumocfg")
         runs = {"mixed": "calm", "own": "hasty"}

@@ -14,8 +14,8 @@ import yaml
 
 import cfx
 from cfx.app.cli import main
-from cfx.core.errors import ConfigError, DataError, OutputError
 from cfx.core.registry import create
+from cfx.errors import ConfigError, DataError, OutputError
 from cfx.models.base import DrivingModel
 from cfx_sumo.demo.motorway import SHIPPED
 from cfx_sumo.export import export

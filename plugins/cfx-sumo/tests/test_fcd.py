@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cfx.app.cli import main
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx_contracts import check_contract
 from cfx_sumo.fcd import SumoFcdDataset
 from cfx_sumo.fcd_lanes import Lanes

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from cfx.core.errors import DataError, OutputError
+from cfx.errors import DataError, OutputError
 from cfx_sumo.live.driver import Driver
 from cfx_sumo.live.fleet import Fleet
 from tests.agents import adaptive

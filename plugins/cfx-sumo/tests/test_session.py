@@ -21,7 +21,7 @@ import psutil
 import pytest
 
 from cfx.core.distributions import install_line
-from cfx.core.errors import NotInstalledError, SumoError
+from cfx.errors import NotInstalledError, SumoError
 from cfx_sumo import installed
 from cfx_sumo.simulation.session import Session
 from cfx_sumo.simulation.worker import Answer, Request

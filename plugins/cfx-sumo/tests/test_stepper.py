@@ -11,7 +11,7 @@ from torch import Tensor
 
 import cfx
 from cfx import DrivingModel, Follower, Leader, Start
-from cfx.core.errors import ConfigError, SumoError
+from cfx.errors import ConfigError, SumoError
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper

@@ -20,7 +20,7 @@ from pathlib import Path
 os.environ["LIBSUMO_AS_TRACI"] = "quiet"
 import libsumo
 import torch
-from cfx.core.errors import SumoError
+from cfx.errors import SumoError
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.live.bridge import bridge_of
 from cfx_sumo.live.surroundings import DirectReader, SubscribedReader, look, view_of

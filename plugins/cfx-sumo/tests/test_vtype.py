@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from cfx.app.cli import main
-from cfx.core.errors import ConfigError, ParameterError
 from cfx.core.registry import create
+from cfx.errors import ConfigError, ParameterError
 from cfx_sumo.vtype import SumoVType
 
 TAU = {"tau": {"low": 0.5, "high": 3.0, "default": 1.0}}

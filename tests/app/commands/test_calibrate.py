@@ -10,8 +10,8 @@ import pytest
 
 from cfx.app import cli
 from cfx.app.commands.calibrate import overrides_of
-from cfx.core.errors import ConfigError
 from cfx.data.tidy import write_tidy
+from cfx.errors import ConfigError
 from cfx.simulation.synthetic import SyntheticDataset
 
 QUICK = [

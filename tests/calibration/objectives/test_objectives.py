@@ -18,7 +18,7 @@ from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.calibration.theil_u import TheilU
 from cfx.core import registry
 from cfx.core.distributions import OWN
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx_contracts import check_contract
 
 SHIPPED = {

@@ -7,7 +7,7 @@ from botorch.models import SingleTaskGP
 import cfx
 from cfx.calibration import botorch
 from cfx.calibration.botorch import BotorchOptimizer
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx_contracts.optimizers import Function, Problems, bowl, distance
 
 

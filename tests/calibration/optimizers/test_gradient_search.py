@@ -10,7 +10,7 @@ from torch import Tensor
 
 from cfx.calibration.gradient_search import GradientSearch, _stages
 from cfx.calibration.random_search import RandomSearch
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx_contracts import check_contract
 from cfx_contracts.optimizers import Problems, bowl, distance
 

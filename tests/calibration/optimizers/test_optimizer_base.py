@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.optimizers import TIE_ABSOLUTE, CandidateLosses, Optimizer
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 from cfx_contracts.optimizers import Problems, distance
 
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from cfx.calibration.random_search import RandomSearch
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx_contracts.optimizers import Problems, bowl, distance
 
 

@@ -13,7 +13,7 @@ import pytest
 
 from cfx.core import registry
 from cfx.core.distributions import install_line
-from cfx.core.errors import ConfigError, EngineError, NotInstalledError
+from cfx.errors import ConfigError, EngineError, NotInstalledError
 from cfx_dask.engine.engine import DaskEngine
 from tests.core.engine.clusters import Cluster, free_port
 from tests.core.engine.work import dies, only_on_good, slowly, where

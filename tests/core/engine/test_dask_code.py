@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from cfx.core.errors import EngineError
+from cfx.errors import EngineError
 from cfx_dask.engine.code import differing, installed_code
 from cfx_dask.engine.engine import DaskEngine
 from tests.core.engine.clusters import ROOT, Cluster

@@ -17,10 +17,10 @@ from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.core.engine import Engine
-from cfx.core.errors import EngineError
 from cfx.core.local_engine import LocalEngine
 from cfx.core.progress import Task
 from cfx.data.pairs import PairBatch
+from cfx.errors import EngineError
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Windows, WindowSettings

@@ -16,7 +16,7 @@ import cfx
 from cfx.app.job.console import methods_table
 from cfx.app.sweep.folder import JobStatus
 from cfx.app.sweep.summary import metric_columns, rows, summary_table, write_summary
-from cfx.core.errors import PluginError
+from cfx.errors import PluginError
 from cfx.evaluation.metrics.base import ALWAYS, MetricSet
 from tests.broken_plugins import QUICK
 from tests.installer import Installer

@@ -18,9 +18,9 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.core.errors import DataError
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.data.tidy import write_tidy
+from cfx.errors import DataError
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
 from cfx.evaluation.result import Purpose
 from cfx.learners.base import TrainingData, TrainingResult

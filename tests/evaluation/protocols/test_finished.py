@@ -12,8 +12,8 @@ import torch
 import yaml
 
 import cfx
-from cfx.core.errors import CfxError, DataError
 from cfx.data.pairs import PairBatch
+from cfx.errors import CfxError, DataError
 from cfx.evaluation.closed_loop import Followers
 from cfx.evaluation.forecasts import Origins
 from cfx.policies import checkpoint
@@ -65,7 +65,7 @@ def test_the_finished_policy_forecasts_from_every_moment(drawn: Path, tmp_path: 
     table = pd.read_parquet(result.folder / "forecasts.parquet")
     rows = table[(table["method"] == "policy") & (table["horizon_s"] == 2.0)]
     batch = PairBatch.of(elsewhere())
-    agent = checkpoint.load(drawn / "policy").for_unseen_drivers()
+    agent = checkpoint.load_agent(drawn / "policy").for_unseen_drivers()
     ids = {pair.pair_id: number for number, pair in enumerate(elsewhere())}
     origins = Origins(
         torch.tensor([ids[name] for name in rows["pair_id"]]),

@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 
 import cfx
-from cfx.core.errors import CfxError
 from cfx.data.pairs import PairSet
+from cfx.errors import CfxError
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.results.table import Findings
 from cfx_forecasts.errors import FORECAST_METHODS

@@ -14,12 +14,12 @@ import torch
 from scipy.optimize import minimize_scalar
 
 import cfx
-from cfx.core.errors import ConfigError, DataError
 from cfx.data.pairs import PairBatch
 from cfx.data.tidy import TidyDataset
+from cfx.errors import ConfigError, DataError
 from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
 from cfx.evaluation.result import Array
-from cfx.policies.checkpoint import load
+from cfx.policies.checkpoint import load_agent
 from cfx.policies.context import ExpectedError, conformal_bound
 from cfx.policies.ready import folder_of_ready_made
 from cfx.results.table import Findings
@@ -119,7 +119,7 @@ def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) ->
         np.testing.assert_allclose(found, past[f"rmse_speed_{method}"])
     metrics = json.loads((folder / "metrics.json").read_text())
     assert metrics["past/share"] == pytest.approx(past["share"].mean())
-    agent = load(folder / "policy")
+    agent = load_agent(folder / "policy")
     assert agent.context_rule.combines
     expected = agent.trained_on.expected_error
     assert expected is not None
@@ -144,7 +144,9 @@ def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) ->
 
 
 def test_drivers_are_unlike_those_learned_from_by_standard_deviations() -> None:
-    agent = load(folder_of_ready_made("cfx://i80-idm-history") / "policy").for_unseen_drivers()
+    agent = load_agent(
+        folder_of_ready_made("cfx://i80-idm-history") / "policy"
+    ).for_unseen_drivers()
     count = len(agent.core.driver_features)
     mean, scale = agent.scaler.mean[0, -count:].double(), agent.scaler.scale[0, -count:].double()
     away = torch.tensor([0.0, 1.0, -2.0, 5.0, 0.5, float("nan")], dtype=torch.float64)
@@ -174,7 +176,9 @@ _PARTS = ("past_rmse_speed", "rmse_speed", "bound")
 
 
 def test_a_motorway_is_unlike_the_congestion_that_was_learned_from(shared_data: Path) -> None:
-    agent = load(folder_of_ready_made("cfx://i80-idm-history") / "policy").for_unseen_drivers()
+    agent = load_agent(
+        folder_of_ready_made("cfx://i80-idm-history") / "policy"
+    ).for_unseen_drivers()
     unlike = {}
     for name in ("i80_reconstructed", "openacc_vicolungo"):
         pairs = TidyDataset(path=str(shared_data / f"{name}_pairs.parquet"), min_duration=30).load()

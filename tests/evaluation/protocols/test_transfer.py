@@ -12,13 +12,13 @@ import torch
 import yaml
 
 import cfx
-from cfx.core.errors import CfxError, DataError, TrackingError
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.tidy import TidyDataset, frame_of, write_tidy
+from cfx.errors import CfxError, DataError, TrackingError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.protocols.transfer import Transfer
 from cfx.policies import checkpoint
-from cfx.policies.core import ALL
+from cfx.policies.core import ANY_DRIVER
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx_contracts import check_contract
@@ -118,9 +118,9 @@ def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
     unseen: Path, moved: cfx.JobResult
 ) -> None:
     result = moved
-    policy = checkpoint.load(unseen / "policy")
+    policy = checkpoint.load_agent(unseen / "policy")
     batch = PairBatch.of(elsewhere())
-    number = torch.full((3,), policy.names.index(ALL))
+    number = torch.full((3,), policy.names.index(ANY_DRIVER))
     model = cfx.get("model", "krauss")()
     loop = simulate_closed_loop(
         MemoryStepper(model, 0.1),
@@ -265,6 +265,6 @@ def test_a_job_that_drives_a_saved_policy_hands_it_on(
     twice = transferred(moved.folder, tmp_path)
     pd.testing.assert_frame_equal(twice.pairs, moved.pairs)
     assert (
-        checkpoint.load(twice.folder / "policy").trained_on.pairs
-        == checkpoint.load(unseen / "policy").trained_on.pairs
+        checkpoint.load_agent(twice.folder / "policy").trained_on.pairs
+        == checkpoint.load_agent(unseen / "policy").trained_on.pairs
     )

@@ -15,8 +15,8 @@ from cfx.calibration.mixed import Mixed
 from cfx.calibration.objectives import Objective
 from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.calibration.theil_u import TheilU
-from cfx.core.errors import ConfigError
 from cfx.data.pairs import PairBatch
+from cfx.errors import ConfigError
 from cfx.learners.base import TrainingPairs, TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.learners.rollout.module import RolloutModule

@@ -9,12 +9,12 @@ from typing import Any
 import pytest
 import torch
 
-from cfx.core.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.models.w99 import W99
-from cfx.policies.checkpoint import save
-from cfx.policies.core import ALL
+from cfx.policies.checkpoint import save_agent
+from cfx.policies.core import ANY_DRIVER
 from cfx.simulation.windows import WindowSettings
 from tests.learners.made import COMPILED, QUICK, gru, loop, ready, training_data
 
@@ -28,7 +28,9 @@ def learned(folder: Path, ensemble_size: int = 2) -> TrainingResult:
     result = RolloutLearner(**options).fit(gru(), data)
     agent = ready(result, data, gru())
     node = {"name": "krauss"}
-    save(replace(agent, names=(ALL,), model_node=node, policy_node=node_of_policy()), folder)
+    save_agent(
+        replace(agent, names=(ANY_DRIVER,), model_node=node, policy_node=node_of_policy()), folder
+    )
     return result
 
 

@@ -11,7 +11,7 @@ import torch
 import cfx
 from cfx.app import cli
 from cfx.app.job.steps import Parts, complete, make_protocol
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx.policies import checkpoint, ready
 from cfx.policies.features import History
 
@@ -165,15 +165,15 @@ def test_a_policy_that_answers_what_its_model_does_not_use_is_tested_all_the_sam
 def test_a_policy_that_is_too_large_or_no_object_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    agent = checkpoint.load(ready.FOLDER / NAMES[0] / "policy")
-    checkpoint.save(agent, tmp_path)
+    agent = checkpoint.load_agent(ready.FOLDER / NAMES[0] / "policy")
+    checkpoint.save_agent(agent, tmp_path)
     monkeypatch.setattr("cfx.core.job_folder._LARGEST_MB", 0.2)
     with pytest.raises(DataError, match=r"policy\.safetensors has 0 MB, at most 0\.2"):
-        checkpoint.load(tmp_path)
+        checkpoint.load_agent(tmp_path)
     monkeypatch.undo()
     (tmp_path / "policy.json").write_text(json.dumps([1, 2]))
     with pytest.raises(DataError, match="is no JSON object"):
-        checkpoint.load(tmp_path)
+        checkpoint.load_agent(tmp_path)
     (tmp_path / "policy.safetensors").write_bytes(b"\xff" * 100)
     with pytest.raises(DataError, match="holds no policy that can be read"):
-        checkpoint.load(tmp_path)
+        checkpoint.load_agent(tmp_path)

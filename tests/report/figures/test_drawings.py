@@ -13,8 +13,8 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
-from cfx.core.errors import ConfigError, OutputError
 from cfx.core.parameters import Parameter, ParameterSpace
+from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.figures.figure import Results, draw, figure_named, write_figure, write_figures
 from cfx.figures.text import COLOURS, percent, pretty_unit, short, unit_label

@@ -12,7 +12,7 @@ from matplotlib.text import Text
 from cfx.app import cli
 from cfx.core import registry
 from cfx.core.distributions import OWN
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.figures.canvas import Paper, canvas, on_paper, points, side_by_side, wrapped
 from cfx.figures.figure import Results, draw, figure_named
 from tests.made_up import make_results

@@ -16,7 +16,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx import DrivingModel, Follower, Leader, ParameterSpace, Settings
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.models.base import ModelSettings
 from cfx_community.models.delay import frames_seen, memory_width, perceive, recall, remember
 from cfx_community.models.gipps import GIPPS_PARAMETERS, intended_speed

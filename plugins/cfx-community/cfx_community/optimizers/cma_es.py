@@ -19,7 +19,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx import CandidateLosses, Optimizer, Settings
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 
 if TYPE_CHECKING:
     Floats = NDArray[np.float64]

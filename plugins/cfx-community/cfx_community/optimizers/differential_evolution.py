@@ -23,7 +23,7 @@ from pydantic import Field, model_validator
 from torch import Tensor
 
 from cfx import CandidateLosses, Optimizer, Settings
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 
 Floats = NDArray[np.float64]
 

@@ -17,8 +17,8 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from cfx.core.errors import ConfigError
 from cfx.core.parameters import squashed
+from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import History, Summary

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cfx.core.distributions import install_line
-from cfx.core.errors import EngineError, NotInstalledError
 from cfx.core.threads import cores
+from cfx.errors import EngineError, NotInstalledError
 from cfx_dask.engine.settings import DaskSettings
 
 _WORKERS_ELSEWHERE = 4

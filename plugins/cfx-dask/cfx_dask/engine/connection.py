@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from typing import Any
 
-from cfx.core.errors import EngineError
+from cfx.errors import EngineError
 from cfx_dask.engine import clusters
 from cfx_dask.engine.settings import DaskSettings
 

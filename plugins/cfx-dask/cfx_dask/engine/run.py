@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Generic
 
 from cfx.core.engine import Report, ResultT, ShardT, Work
-from cfx.core.errors import EngineError
+from cfx.errors import EngineError
 from cfx_dask.engine.code import installed_code
 from cfx_dask.engine.connection import Connection
 from cfx_dask.engine.settings import DaskSettings

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from cfx.policies.agent import Agent
-from cfx.policies.checkpoint import load
+from cfx.policies.checkpoint import load_agent
 from cfx.policies.driver_step import DriverStep
 from cfx.results.tracker import folder_of
 
@@ -26,4 +26,4 @@ def driver_step(driver: str | Path | Agent) -> DriverStep:
     folder = folder_of(driver)
     if not (folder / "policy.json").is_file():
         folder = folder / "policy"
-    return DriverStep(load(folder))
+    return DriverStep(load_agent(folder))

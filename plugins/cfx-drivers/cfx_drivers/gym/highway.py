@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from highway_env.vehicle.behavior import IDMVehicle
 
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.models.composed import COMFORTABLE
 from cfx.policies.driver_step import DriverState, DriverStep, Motion
 from cfx_drivers.gym.drivers import driver_step

@@ -22,7 +22,7 @@ from torch import Tensor
 
 import cfx
 from cfx import PairBatch, PairSet
-from cfx.core.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError
 from cfx.models.limits import LimitSettings, limited_speed
 from cfx.policies.agent import Agent
 from cfx.policies.driver_step import Motion

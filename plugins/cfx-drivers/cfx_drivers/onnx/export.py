@@ -11,11 +11,11 @@ from pathlib import Path
 import torch
 
 from cfx.core.command import ExportFormat
-from cfx.core.errors import ConfigError, DataError
 from cfx.core.files import write_output
+from cfx.errors import ConfigError, DataError
 from cfx.policies.agent import Agent
-from cfx.policies.checkpoint import load
-from cfx.policies.core import ALL
+from cfx.policies.checkpoint import load_agent
+from cfx.policies.core import ANY_DRIVER
 from cfx.policies.driver_step import DriverStep
 from cfx.results.tracker import folder_of
 from cfx_drivers.onnx.agreement import largest_difference
@@ -64,8 +64,8 @@ def _agent(run: str, folder: Path, network: str) -> Agent:
     """
     if not (folder / "policy.json").is_file():
         folder = folder / "policy"
-    agent = load(folder)
-    if not network or (network == ALL and ALL not in agent.names):
+    agent = load_agent(folder)
+    if not network or (network == ANY_DRIVER and ANY_DRIVER not in agent.names):
         return agent.for_unseen_drivers()
     if network not in agent.names:
         raise DataError(

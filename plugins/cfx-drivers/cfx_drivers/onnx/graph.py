@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 import cfx
-from cfx.core.errors import ConfigError
+from cfx.errors import ConfigError
 from cfx.policies.driver_step import DriverState, DriverStep, Motion
 
 OPSET = 20

@@ -13,15 +13,15 @@ from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
 from cfx import Settings
-from cfx.core.errors import ConfigError
 from cfx.core.memory import require_memory
+from cfx.errors import ConfigError
 from cfx.evaluation.closed_loop import Followers, burnt_in
 from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
 from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
 from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.constant import FixedPolicy
-from cfx.policies.core import ALL
+from cfx.policies.core import ANY_DRIVER
 from cfx.policies.features import measured_history
 from cfx.simulation.rollout import MemoryStepper
 from cfx_forecasts.noise import can_drive, constant_with_noise, residual_noise
@@ -307,9 +307,9 @@ def _pooled(test: HeldOut) -> Tensor | None:
     """Returns the pooled parameters of all drivers for each test driver, `(P, n)`; None: none."""
     if test.population is None:
         return None
-    if ALL not in test.policy.names:
+    if ANY_DRIVER not in test.policy.names:
         return test.population[test.network]
-    number = test.policy.names.index(ALL)
+    number = test.policy.names.index(ANY_DRIVER)
     return test.population[number].expand(len(test.pairs), -1)
 
 

@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 import cfx
-from cfx.core.errors import CfxError
+from cfx.errors import CfxError
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.results.table import Findings
 from cfx_forecasts.traffic.summary import TRAFFIC_METHODS

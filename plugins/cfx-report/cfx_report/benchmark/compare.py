@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from cfx.core.errors import DataError
+from cfx.errors import DataError
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx_report.benchmark.row import COUNTS
 

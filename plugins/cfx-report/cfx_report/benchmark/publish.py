@@ -18,13 +18,13 @@ from typing import Any
 import pandas as pd
 import torch
 
-from cfx.core.errors import ConfigError, DataError, nearest
 from cfx.core.files import atomic_write, path_override, write_json
+from cfx.errors import ConfigError, DataError, nearest
 from cfx.policies.agent import Agent
-from cfx.policies.checkpoint import load, save
+from cfx.policies.checkpoint import load_agent, save_agent
 from cfx.policies.context import ExpectedError
 from cfx.policies.ready import FOLDER
-from cfx.policies.valid_range import FADED, SIGNALS
+from cfx.policies.valid_range import FADED, RANGE_SIGNALS
 from cfx_report.benchmark.recipes import I80, RECIPES
 
 _SOURCES = {
@@ -86,13 +86,13 @@ def publish(name: str, job: Path) -> None:
     Raises:
         DataError: the job has no policy for unseen drivers.
     """
-    agent = load(job / "policy").for_unseen_drivers()
+    agent = load_agent(job / "policy").for_unseen_drivers()
     metrics = json.loads((job / "metrics.json").read_text(encoding="utf-8"))
     data = json.loads((job / "data.json").read_text(encoding="utf-8"))
     folder = FOLDER / name
     if folder.is_dir():
         shutil.rmtree(folder)
-    save(agent, folder / "policy")
+    save_agent(agent, folder / "policy")
     write_json(folder / "metrics.json", metrics)
     card = _card(name, agent, metrics, data)
     if (job / "sites.csv").is_file():
@@ -233,7 +233,7 @@ def _range(agent: Agent) -> dict[str, Any]:
     if found is None:
         return {}
     bounds = {}
-    for number, signal in enumerate(SIGNALS):
+    for number, signal in enumerate(RANGE_SIGNALS):
         low, high = found.low[0, number], found.high[0, number]
         name = signal
         if signal == "log_gap":

@@ -10,8 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.core.errors import DataError
 from cfx.core.files import write_json
+from cfx.errors import DataError
 from cfx.evaluation.metrics.base import column_of
 from cfx.evaluation.statistics import mean_interval
 from cfx_report.benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import cast
 
 import cfx
-from cfx.core.errors import ConfigError, DataError, Terminated, nearest
 from cfx.core.files import atomic_write, path_override
+from cfx.errors import ConfigError, DataError, Terminated, nearest
 from cfx_report.benchmark.frozen import DATA, DATA_NAME, FROZEN_KEYS, METHODS, OVERRIDES
 from cfx_report.benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_of
 

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.data.style import ALL, INDICATORS, Group, StyleResult, groups, name_of_indicator
+from cfx.data.style import ALL_TYPES, INDICATORS, Group, StyleResult, groups, name_of_indicator
 from cfx.figures.canvas import Array, canvas, hover, most_across, points, styled
 from cfx.figures.figure import JobFigure, Results
 from cfx.figures.text import INK, JOB_COLOURS
@@ -67,7 +67,7 @@ def _panel(axes: Axes, values: Array, shown: Sequence[Group], title: str) -> Non
     scatter = np.random.default_rng(0)
     for place, group in enumerate(shown):
         mine = values[group.chosen & np.isfinite(values)]
-        whole = group.driver_type == ALL
+        whole = group.driver_type == ALL_TYPES
         colour = JOB_COLOURS[sites.index(group.site) % len(JOB_COLOURS)] if whole else _TYPE_COLOUR
         if len(mine) >= _VIOLIN and np.ptp(mine) > 0:
             violin = axes.violinplot(
@@ -89,7 +89,7 @@ def _panel(axes: Axes, values: Array, shown: Sequence[Group], title: str) -> Non
         hover(mark, f"{_called(group)}: median {middle:.3g}, {len(mine)} drivers")
     axes.set_yticks(range(len(shown)), [_called(group) for group in shown])
     for tick, group in zip(axes.get_yticklabels(), shown, strict=True):
-        tick.set_fontweight("bold" if group.driver_type == ALL else "normal")
+        tick.set_fontweight("bold" if group.driver_type == ALL_TYPES else "normal")
     axes.set_ylim(len(shown) - 0.4, -0.6)
     axes.set_title(title, fontsize=points(9.5))
     axes.xaxis.set_major_locator(MaxNLocator(4))
@@ -98,17 +98,17 @@ def _panel(axes: Axes, values: Array, shown: Sequence[Group], title: str) -> Non
 
 
 def _called(group: Group) -> str:
-    return group.site if group.driver_type == ALL else group.driver_type
+    return group.site if group.driver_type == ALL_TYPES else group.driver_type
 
 
 def _matrix(axes: Axes, shown: Sequence[Group], distances: pd.DataFrame | None) -> None:
     """Draws the distances between the scores of sites; pale where chance may explain them."""
-    sites = [group.site for group in shown if group.driver_type == ALL]
+    sites = [group.site for group in shown if group.driver_type == ALL_TYPES]
     number = {site: index for index, site in enumerate(sites)}
     matrix = np.full((len(sites), len(sites)), np.nan)
     p_values = np.ones_like(matrix)
     if distances is not None:
-        for _, row in distances[distances["driver_type"] == ALL].iterrows():
+        for _, row in distances[distances["driver_type"] == ALL_TYPES].iterrows():
             place = number[str(row["other_site"])], number[str(row["site"])]
             matrix[place], p_values[place] = row["distance"], row["p_value"]
     axes.imshow(np.ma.masked_invalid(matrix), cmap="Blues", vmin=0, aspect="auto")

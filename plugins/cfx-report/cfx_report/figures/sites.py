@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from cfx.evaluation.sites import ALL
+from cfx.evaluation.sites import ALL_SITES
 from cfx.figures.canvas import canvas, hover, percent_tick
 from cfx.figures.figure import JobFigure, Results
 from cfx.figures.text import COLOURS, INK, label, percent
@@ -44,14 +44,14 @@ def draw_sites(sites: pd.DataFrame) -> Figure | None:
     axes[0].set_yticks(range(len(names)), [_called(*name) for name in names])
     axes[0].invert_yaxis()
     for tick, (site, kind) in zip(axes[0].get_yticklabels(), names, strict=True):
-        tick.set_fontweight("bold" if kind == ALL and site == ALL else "normal")
+        tick.set_fontweight("bold" if kind == ALL_SITES and site == ALL_SITES else "normal")
     return figure
 
 
 def _called(site: str, kind: str) -> str:
-    if kind != ALL:
+    if kind != ALL_SITES:
         return f"{kind}"
-    return "mean over sites" if site == ALL else site
+    return "mean over sites" if site == ALL_SITES else site
 
 
 def _panel(axes: Axes, rows: pd.DataFrame, baseline: str, names: list[tuple[str, str]]) -> None:
@@ -61,7 +61,7 @@ def _panel(axes: Axes, rows: pd.DataFrame, baseline: str, names: list[tuple[str,
         if not np.isfinite(value):
             continue
         place = places[(row["site"], row["driver_type"])]
-        is_whole = row["driver_type"] == ALL
+        is_whole = row["driver_type"] == ALL_SITES
         colour = COLOURS["policy"] if is_whole else "#9a9a9a"
         ends = [float(row[f"over_{baseline}_{end}"]) for end in ("low", "high")]
         if np.isfinite(ends).all():

@@ -16,7 +16,7 @@ from matplotlib.gridspec import GridSpec
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
-from cfx.core.errors import ConfigError, nearest
+from cfx.errors import ConfigError, nearest
 from cfx.evaluation.result import PairTrajectory
 from cfx.figures.canvas import (
     HIDDEN,

@@ -9,7 +9,7 @@ from typing import Any
 
 from cfx.core.distributions import OWN
 from cfx.core.registry import installed
-from cfx.data.style import ALL, name_of_indicator
+from cfx.data.style import ALL_TYPES, name_of_indicator
 from cfx.evaluation.result import Purpose
 from cfx.figures.job import Job
 from cfx.figures.text import percent, plural, short_label
@@ -67,7 +67,7 @@ class StyleSection(Section):
 
 def _group(row: Mapping[str, Any], prefix: str) -> str:
     site, kind = row[f"{prefix}site"], row[f"{prefix}driver_type"]
-    return str(site) if kind == ALL else f"{site}, {kind}"
+    return str(site) if kind == ALL_TYPES else f"{site}, {kind}"
 
 
 _DISTANCES: tuple[Column[dict[str, Any]], ...] = (

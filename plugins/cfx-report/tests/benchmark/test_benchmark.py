@@ -11,8 +11,8 @@ import pytest
 
 import cfx
 from cfx.app.cli import main
-from cfx.core.errors import DataError, Terminated
 from cfx.data.tidy import write_tidy
+from cfx.errors import DataError, Terminated
 from cfx_report.benchmark.compare import compared, lines_of, read_errors
 from cfx_report.benchmark.frozen import DATA, METHODS, TESTED, protocol_hash
 from cfx_report.benchmark.row import Row, errors_of, markdown, protocol_name, values_of

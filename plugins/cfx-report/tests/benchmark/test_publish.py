@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from cfx.core.errors import ConfigError
-from cfx.policies.checkpoint import load, save
+from cfx.errors import ConfigError
+from cfx.policies.checkpoint import load_agent, save_agent
 from cfx.policies.ready import FOLDER, card_of, names
 from cfx_report.benchmark import publish
 from cfx_report.benchmark.publish import card_text, make
@@ -25,8 +25,8 @@ def test_a_finished_job_is_published_without_training(
     name = names()[0]
     job, folder = tmp_path / "work" / name, tmp_path / "ready"
     published = FOLDER / name
-    agent = load(published / "policy")
-    save(agent, job / "policy")
+    agent = load_agent(published / "policy")
+    save_agent(agent, job / "policy")
     (job / "metrics.json").write_text((published / "metrics.json").read_text())
     (job / "data.json").write_text(json.dumps({"fingerprint": "abc"}))
     monkeypatch.setattr(publish, "FOLDER", folder)

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.core.errors import DataError, SumoError
+from cfx.errors import DataError, SumoError
 
 Array = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.core.errors import SumoError
+from cfx.errors import SumoError
 from cfx_sumo.simulation.worker import Array, printed_errors, printed_here
 
 FOLLOWERS = ("real", "policy", "default")

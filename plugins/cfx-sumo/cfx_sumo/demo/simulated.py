@@ -16,11 +16,11 @@ import torch
 from numpy.typing import NDArray
 
 from cfx import Pair, PairBatch, PairSet
-from cfx.core.errors import DataError, SumoError
 from cfx.core.processes import worker_pool
+from cfx.errors import DataError, SumoError
 from cfx.evaluation.result import Evaluation, PairTrajectory
 from cfx.policies.agent import Agent
-from cfx.policies.core import ALL
+from cfx.policies.core import ANY_DRIVER
 from cfx_report.figures.trajectories import evenly_spread
 from cfx_sumo.demo.motorway import ABREAST, Motorway
 from cfx_sumo.demo.replay import FOLLOWERS, ReplayRequest, replay
@@ -226,7 +226,7 @@ def _networks(evaluation: Evaluation, policy: Agent) -> dict[str, str]:
     table = evaluation.table.drop_duplicates("pair_id").set_index("pair_id")
     found = {}
     for pair_id in [trajectory.pair_id for trajectory in evaluation.trajectories]:
-        candidates = [pair_id, ALL, policy.names[0]]
+        candidates = [pair_id, ANY_DRIVER, policy.names[0]]
         if "fold" in table and pd.notna(table["fold"][pair_id]):
             candidates.insert(0, f"fold {int(table['fold'][pair_id])}")
         found[pair_id] = next(name for name in candidates if name in policy.names)

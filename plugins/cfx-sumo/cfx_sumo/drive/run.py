@@ -22,9 +22,9 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from cfx.core.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.core.files import atomic_write
 from cfx.core.progress import Task
+from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx_sumo.drive.distributions import members_of
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.installed import require_sumo

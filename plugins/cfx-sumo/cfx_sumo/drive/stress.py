@@ -16,9 +16,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.core.errors import SumoError
 from cfx.core.files import write_json
 from cfx.core.progress import Task
+from cfx.errors import SumoError
 from cfx_sumo.drive.queue import SECONDS, QueueAtLight, queue_of
 from cfx_sumo.drive.run import command_line, started
 from cfx_sumo.drive.scenarios import ASSETS, CAR, SCENARIOS, STEP_S, Scenario

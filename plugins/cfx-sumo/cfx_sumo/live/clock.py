@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from cfx.core.errors import SumoError
+from cfx.errors import SumoError
 
 SHORTEST_S, LONGEST_S = 0.01, 1.0
 """Steps of simulations in which vehicles are driven."""

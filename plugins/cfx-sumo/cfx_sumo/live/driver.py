@@ -23,17 +23,17 @@ import torch
 from torch import Tensor
 
 from cfx import DrivingModel, Follower, Leader
-from cfx.core.errors import DataError, ParameterError, SumoError
 from cfx.core.job_folder import parse_json
 from cfx.core.registry import create
 from cfx.core.threads import one_thread
+from cfx.errors import DataError, ParameterError, SumoError
 from cfx.models.limits import at_limits
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.base import ConstantNetwork
-from cfx.policies.checkpoint import load as load_checkpoint
+from cfx.policies.checkpoint import load_agent as load_checkpoint
 from cfx.policies.constant import FixedPolicy
 from cfx.policies.context import DriverContext
-from cfx.policies.core import ALL, AgentCore
+from cfx.policies.core import ANY_DRIVER, AgentCore
 from cfx.policies.features import History, Scaler
 from cfx.policies.heads.base import DirectHead
 from cfx.policies.valid_range import share_in_words
@@ -177,7 +177,7 @@ class Driver:
         self,
         policy: Agent,
         *,
-        network: str | None = ALL,
+        network: str | None = ANY_DRIVER,
         look_ahead: float = 200.0,
         speed_mode: int = OBEYS_ALL,
         model: DrivingModel | None = None,
@@ -248,7 +248,7 @@ class Driver:
         cls,
         run: str | Path,
         *,
-        network: str | None = ALL,
+        network: str | None = ANY_DRIVER,
         model: str | None = None,
         **options: Unpack[DriverOptions],
     ) -> Driver:
@@ -310,7 +310,7 @@ class Driver:
             policy_node={"name": "fixed"},
             windows=WindowSettings(),
             dt=dt,
-            names=(ALL,),
+            names=(ANY_DRIVER,),
             population=values[None],
         )
         return cls(policy, model=model, source="the constant driver", **options)
@@ -724,9 +724,9 @@ class Driver:
         names = self.policy.names
         if network in names:
             return names.index(network)
-        if network == ALL and len(names) == 1:
+        if network == ANY_DRIVER and len(names) == 1:
             return 0
-        if network == ALL:
+        if network == ANY_DRIVER:
             raise DataError(
                 f"{self.source} has {len(names)} networks, each for one driver ({names[0]}, ...),"
                 " and none for unseen drivers; train with protocol.networks=all or"

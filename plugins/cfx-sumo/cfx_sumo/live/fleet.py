@@ -8,9 +8,9 @@ from typing import Unpack
 
 import torch
 
-from cfx.core.errors import DataError
 from cfx.core.threads import one_thread
-from cfx.policies.core import ALL
+from cfx.errors import DataError
+from cfx.policies.core import ANY_DRIVER
 from cfx_sumo.live.driver import Driver, DriverOptions, Together
 from cfx_sumo.live.saved import read_state, write_state
 from cfx_sumo.live.surroundings import Connection
@@ -57,7 +57,7 @@ class Fleet:
         cls,
         runs: Mapping[str, str | Path],
         *,
-        network: str = ALL,
+        network: str = ANY_DRIVER,
         **options: Unpack[DriverOptions],
     ) -> Fleet:
         """Reads the policy of a run for each vType; types with the same run share a driver.

@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx.core.errors import SumoError
+from cfx.errors import SumoError
 from cfx_sumo.live.bridge import Read, bridge_of
 
 Connection = Any

@@ -13,7 +13,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from cfx.core.distributions import install_line
-from cfx.core.errors import ConfigError, SumoError, nearest
+from cfx.errors import ConfigError, SumoError, nearest
 from cfx.models.vtype import VType
 from cfx_sumo.installed import DISTRIBUTION
 

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from cfx import DrivingModel, Follower, Leader, Stepper
 from cfx.core.component import content_key, folder_hash
-from cfx.core.errors import ConfigError, SumoError, listed
 from cfx.core.threads import cores
+from cfx.errors import ConfigError, SumoError, listed
 from cfx.models.vtype import InSumo, VType
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.limits import lost_limits

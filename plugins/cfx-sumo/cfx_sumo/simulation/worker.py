@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfx.core.distributions import install_line
-from cfx.core.errors import SumoError
+from cfx.errors import SumoError
 from cfx_sumo.installed import DISTRIBUTION
 from cfx_sumo.simulation.network import FOLLOWER, LANE, LEADER, ROAD, Placed, network, routes
 
