@@ -24,7 +24,7 @@ QUICK = (
 
 _MODEL = """
 import torch
-from cfx import DrivingModel, Parameter, ParameterSpace
+from cfx.plugin import DrivingModel, Parameter, ParameterSpace
 
 class Bad(DrivingModel):
     parameters = ParameterSpace.of(
@@ -40,7 +40,7 @@ class Bad(DrivingModel):
 
 POLICY = """
 import torch
-from cfx import Policy, PolicyNetwork
+from cfx.plugin import Policy, PolicyNetwork
 
 class Bad(Policy):
     trainable = False
@@ -63,7 +63,7 @@ class Network(PolicyNetwork):
 
 _OPTIMIZER = """
 import torch
-from cfx import Optimizer
+from cfx.plugin import Optimizer
 
 class Bad(Optimizer):
     def evaluations(self):
@@ -78,7 +78,7 @@ class Bad(Optimizer):
 """
 
 _OBJECTIVE = """
-from cfx import Objective
+from cfx.plugin import Objective
 
 class Bad(Objective):
     unit = "m/s"
@@ -93,7 +93,7 @@ class Bad(Objective):
 
 _DATASET = """
 import numpy as np
-from cfx import Dataset, Pair, PairSet
+from cfx.plugin import Dataset, Pair, PairSet
 
 class Bad(Dataset):
     def read(self):
@@ -107,7 +107,7 @@ class Bad(Dataset):
 """
 
 _SIMULATOR = """
-from cfx import Simulator
+from cfx.plugin import Simulator
 from cfx.simulation.rollout import MemoryStepper
 
 class Bad(Simulator):
@@ -349,7 +349,7 @@ BROKEN = (
         "no_pairs",
         "datasets",
         _DATASET.format("return [pair]"),
-        r"read must return a cfx\.PairSet, but returned a list",
+        r"read must return a cfx\.plugin\.PairSet, but returned a list",
     ),
     Broken(
         "gaps",
@@ -360,15 +360,15 @@ BROKEN = (
     Broken(
         "learns_nothing",
         "learners",
-        "from cfx import Learner\n"
+        "from cfx.plugin import Learner\n"
         "class Bad(Learner):\n    def fit(self, policy, training_data):\n        return None\n",
-        r"fit must return a cfx\.TrainingResult, but returned a NoneType",
+        r"fit must return a cfx\.plugin\.TrainingResult, but returned a NoneType",
     ),
     Broken(
         "no_outcome",
         "protocols",
-        "from cfx import Protocol\n"
+        "from cfx.plugin import Protocol\n"
         "class Bad(Protocol):\n    def run(self, context):\n        return {}\n",
-        r"run must return a cfx\.ProtocolResult, but returned a dict",
+        r"run must return a cfx\.plugin\.ProtocolResult, but returned a dict",
     ),
 )

@@ -13,7 +13,7 @@ from cfx.evaluation.forecasts import LeaderFuture, Origins, Paths, sample_from_o
 from cfx.models.base import DrivingModel, Leader
 from cfx.policies.agent import Agent
 from cfx.simulation.base import Stepper
-from cfx.simulation.rollout import simulate
+from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.trajectory import Start
 
 
@@ -69,7 +69,7 @@ def wavy_pairs(
         torch.full((count,), 5.0, dtype=torch.float64),
     )
     zeros = torch.zeros(count, dtype=torch.float64)
-    out = simulate(
+    out = simulate_follower(
         model, parameters, leader, Start(zeros, torch.as_tensor(leader_speed[:, 0]), zeros), 0.1
     )
     speed = out.speed.numpy()

@@ -244,7 +244,7 @@ def test_outcomes_of_an_earlier_multirun_in_the_same_folder_do_not_count(
 
 
 PLUGIN = """
-    from cfx import Dataset
+    from cfx.plugin import Dataset
 
     class Mine(Dataset):
         def read(self):

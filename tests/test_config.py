@@ -13,18 +13,18 @@ from hypothesis import strategies as st
 from omegaconf import OmegaConf
 from pydantic import Field, ValidationError
 
-from cfx import DrivingModel, Parameter, ParameterSpace, Settings
 from cfx.app import hydra_source, nodes
 from cfx.core import registry
 from cfx.core.files import path_override
 from cfx.errors import ConfigError, PluginError
+from cfx.plugin import DrivingModel, Parameter, ParameterSpace, Settings
 from cfx.results.config import JobConfig
 
 CONF = nodes.conf_dir()
 
 PLUGIN = '''
     from pydantic import Field
-    from cfx import DrivingModel, Parameter, ParameterSpace
+    from cfx.plugin import DrivingModel, Parameter, ParameterSpace
     from cfx.models.base import ModelSettings
 
     class MineSettings(ModelSettings):

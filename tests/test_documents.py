@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import importlib.util
 import pkgutil
 import re
 import shlex
@@ -18,7 +19,7 @@ from cfx.app.hydra_source import composed
 from cfx.core import registry
 from cfx.data.tidy import write_tidy
 from cfx.models.base import DrivingModel
-from cfx.simulation.rollout import simulate
+from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx_contracts import contract_for
 from tests.checkout import ROOT
@@ -109,13 +110,22 @@ def test_the_site_names_pages_that_exist() -> None:
         assert page in pages or is_record, f"{name} is in no menu of mkdocs.yml"
 
 
+def test_the_page_of_the_door_is_made_from_it() -> None:
+    spec = importlib.util.spec_from_file_location("door", ROOT / "docs" / "door.py")
+    assert spec is not None
+    assert spec.loader is not None
+    door = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(door)
+    assert door.PAGE.read_text(encoding="utf-8") == door.text(), "make conf"
+
+
 def test_every_public_name_is_in_the_reference() -> None:
     text = ""
     for path in sorted((ROOT / "docs" / "api").glob("*.md")):
         text += path.read_text(encoding="utf-8")
     known = set(re.findall(r"^::: (\S+)$", text, flags=re.MULTILINE))
-    names = {f"cfx.{name}" for name in cfx.__all__} - {"cfx.__version__", "cfx.errors"}
-    assert known >= {*names, "cfx.errors"}
+    names = {f"cfx.{name}" for name in cfx.__all__} - {"cfx.__version__", "cfx.plugin"}
+    assert known >= names
     for name in known:
         assert pkgutil.resolve_name(name) is not None
 
@@ -198,7 +208,7 @@ def test_the_documents_sub_commands_have_these_options(call: str) -> None:
     if arguments and f"{name}.{arguments[0]}" in registry.names("command"):
         name, arguments = f"{name}.{arguments[0]}", arguments[1:]
     command = cfx.get("command", name)()
-    assert isinstance(command, cfx.Command)
+    assert isinstance(command, cfx.plugin.Command)
     command.parse(arguments)
 
 
@@ -228,14 +238,14 @@ def test_the_model_in_the_guide_can_be_simulated() -> None:
     kind = names["Pipes"]
     assert isinstance(kind, type)
     assert issubclass(kind, DrivingModel)
-    batch = cfx.PairBatch.of(straight_pairs([600]))
-    leader = cfx.Leader(
+    batch = cfx.plugin.PairBatch.of(straight_pairs([600]))
+    leader = cfx.plugin.Leader(
         batch.leader_position, batch.leader_speed, batch.leader_acceleration, batch.leader_length
     )
-    start = cfx.Start(
+    start = cfx.plugin.Start(
         batch.follower_position[:, 0], batch.follower_speed[:, 0], batch.follower_acceleration[:, 0]
     )
-    out = simulate(kind(), {"headway": 2.0}, leader, start, batch.dt)
+    out = simulate_follower(kind(), {"headway": 2.0}, leader, start, batch.dt)
     assert not bool(out.collided.any())
     torch.testing.assert_close(
         out.gap[0, -1], torch.tensor(20.0, dtype=torch.float64), atol=0.5, rtol=0
@@ -244,17 +254,17 @@ def test_the_model_in_the_guide_can_be_simulated() -> None:
 
 def test_the_table_of_kinds_names_what_is_there() -> None:
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
-    row = r"^\| (\w+) \| `cfx\.(\w+)` \| .* \| `(cfx_contracts\.\w+)` \|$"
+    row = r"^\| (\w+) \| `cfx\.plugin\.(\w+)` \| .* \| `(cfx_contracts\.\w+)` \|$"
     rows = re.findall(row, text, flags=re.MULTILINE)
     assert {kind for kind, _, _ in rows} == set(registry.KINDS)
     for kind, base, module in rows:
-        assert getattr(cfx, base).kind == kind
+        assert getattr(cfx.plugin, base).kind == kind
         assert importlib.import_module(module).CONTRACT is contract_for(kind)
-    assert f"`cfx.API_VERSION` ({cfx.API_VERSION})" in text
+    assert f"`cfx.plugin.API_VERSION` ({cfx.plugin.API_VERSION})" in text
     (declared,) = re.findall(
         r'^\[project\.entry-points\."cfx\.api"\]\n(\d+) = ', text, flags=re.MULTILINE
     )
-    assert int(declared) == cfx.API_VERSION
+    assert int(declared) == cfx.plugin.API_VERSION
 
 
 def test_the_map_names_every_room() -> None:

@@ -30,7 +30,7 @@ from omegaconf import OmegaConf
 import cfx
 from cfx.core import registry
 from cfx.core.threads import cores_limit, limit_cores
-from cfx.simulation.rollout import simulate
+from cfx.simulation.rollout import simulate_follower
 
 QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures.enabled=false"]
 QUICK.append("calibration.prior=none")
@@ -80,7 +80,7 @@ def simulation() -> None:
 
 
 def compiled_simulation() -> None:
-    simulate(_model(), None, *_scene(), 0.1, compile="always")
+    simulate_follower(_model(), None, *_scene(), 0.1, compile="always")
 
 
 def refused_simulation() -> None:
@@ -155,19 +155,19 @@ def _disturb(_config: Any, _folder: Path) -> Any:
     raise JobError
 
 
-def _model() -> cfx.DrivingModel:
-    return cast("cfx.DrivingModel", registry.create("model", {"name": "idm"}))
+def _model() -> cfx.plugin.DrivingModel:
+    return cast("cfx.plugin.DrivingModel", registry.create("model", {"name": "idm"}))
 
 
 def _leader() -> pd.DataFrame:
     return pd.DataFrame({"time_s": np.arange(50) * 0.1, "speed": 12.0})
 
 
-def _scene() -> tuple[cfx.Leader, cfx.Start]:
+def _scene() -> tuple[cfx.plugin.Leader, cfx.plugin.Start]:
     speed = torch.full((1, 60), 12.0)
     position = 40 + 1.2 * torch.arange(60.0)[None]
-    leader = cfx.Leader(position, speed, torch.zeros(1, 60), torch.full((1,), 4.5))
-    return leader, cfx.Start(torch.zeros(1), torch.full((1,), 12.0), torch.zeros(1))
+    leader = cfx.plugin.Leader(position, speed, torch.zeros(1, 60), torch.full((1,), 4.5))
+    return leader, cfx.plugin.Start(torch.zeros(1), torch.full((1,), 12.0), torch.zeros(1))
 
 
 def _loggers() -> State:

@@ -19,7 +19,7 @@ RUN = {"sh", "python"}
 """Languages that run; `text` is for what needs the network or a person."""
 
 
-def write_ngsim(pairs: cfx.PairSet, path: Path) -> None:
+def write_ngsim(pairs: cfx.plugin.PairSet, path: Path) -> None:
     """Writes pairs in NGSIM's 18 columns, in feet; each pair on a lane of its own."""
     feet = 0.3048
     lines = []
@@ -41,7 +41,7 @@ def write_ngsim(pairs: cfx.PairSet, path: Path) -> None:
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
 
 
-def write_trips(pairs: cfx.PairSet, path: Path) -> None:
+def write_trips(pairs: cfx.plugin.PairSet, path: Path) -> None:
     """Writes pairs with names of columns of its owner's, speeds in km/h, and gaps alone."""
     frame = frame_of(pairs)
     gap = frame["leader_position_m"] - frame["leader_length_m"] - frame["follower_position_m"]
@@ -67,7 +67,7 @@ def write_recordings(folder: Path) -> None:
     others = []
     for pair in SyntheticDataset(pairs=6, frames=720, seed=1).load():
         others.append(replace(pair, pair_id=f"other-{pair.pair_id}", recording="other"))
-    write_tidy(cfx.PairSet(tuple(others), "other"), folder / "other.parquet")
+    write_tidy(cfx.plugin.PairSet(tuple(others), "other"), folder / "other.parquet")
     write_trips(made, folder / "trips.csv")
     SCENARIOS["motorway"].write(folder, 60.0).rename(folder / "my.sumocfg")
 

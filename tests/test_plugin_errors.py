@@ -17,7 +17,7 @@ Job = Callable[[str, str, str], tuple[int, str]]
 
 MODEL = """
 import torch
-from cfx import DrivingModel, Parameter, ParameterSpace
+from cfx.plugin import DrivingModel, Parameter, ParameterSpace
 
 STEPS = []
 
@@ -91,7 +91,7 @@ def test_errors_of_cfx_itself_are_nobody_elses() -> None:
 
 MIXED = """
 import torch
-from cfx import Optimizer
+from cfx.plugin import Optimizer
 
 class Mixed(Optimizer):
     def evaluations(self):

@@ -23,7 +23,7 @@ from tests.checkout import ROOT
 from tests.installer import Installer
 
 MODEL = """
-    from cfx import DrivingModel, Parameter, ParameterSpace
+    from cfx.plugin import DrivingModel, Parameter, ParameterSpace
 
     class Mine(DrivingModel):
         '''Drives as I like.'''
@@ -249,7 +249,7 @@ def test_a_distribution_that_declares_no_api_counts_as_current_and_gets_a_hint(
 PROTOCOL = """
     import cfx
 
-    class Mine(cfx.Protocol):
+    class Mine(cfx.plugin.Protocol):
         def run(self, context):
             return cfx.get("protocol", "within_driver")().run(context)
 """
@@ -509,7 +509,7 @@ def test_a_new_package_declares_what_it_is(kind: str, novel: Path) -> None:
     assert project["entry-points"][registry.KINDS[kind].entry_points] == {
         "novel": f"cfx_novel.{kind}:Novel"
     }
-    assert project["entry-points"]["cfx.api"] == {str(cfx.API_VERSION): "cfx_novel"}
+    assert project["entry-points"]["cfx.api"] == {str(cfx.plugin.API_VERSION): "cfx_novel"}
     written = [path for path in folder.rglob("*") if path.is_file()]
     assert {"README.md", ".gitignore", "pyproject.toml", "test_novel.py"} <= {
         path.name for path in written
@@ -558,7 +558,7 @@ def test_the_templates_are_in_the_wheel(tmp_path: Path) -> None:
 DEPRECATED = """
     import warnings
     from pydantic import Field
-    from cfx import DrivingModel, ModelSettings, Parameter, ParameterSpace
+    from cfx.plugin import DrivingModel, ModelSettings, Parameter, ParameterSpace
 
     class OldSettings(ModelSettings):
         mood: str = Field("calm", description="how it drives", deprecated="use model.style")

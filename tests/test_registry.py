@@ -14,7 +14,7 @@ MODEL = '''
     """A third party's model."""
     from pydantic import Field
 
-    from cfx import DrivingModel, Parameter, ParameterSpace
+    from cfx.plugin import DrivingModel, Parameter, ParameterSpace
     from cfx.models.base import ModelSettings
 
     class MineSettings(ModelSettings):
@@ -133,38 +133,38 @@ def test_ctrl_c_while_a_plugin_is_imported_stays_ctrl_c(install) -> None:
     [
         ("Bad = 3", "is no class but int"),
         ("class Bad: pass", "does not extend cfx.models.base.DrivingModel"),
-        ("from cfx import Optimizer as Bad", "does not extend cfx.models.base.DrivingModel"),
+        ("from cfx.plugin import Optimizer as Bad", "does not extend cfx.models.base.DrivingModel"),
         (
-            "from cfx import DrivingModel\nclass Bad(DrivingModel): pass",
+            "from cfx.plugin import DrivingModel\nclass Bad(DrivingModel): pass",
             "does not implement next_speed",
         ),
         (
-            "from cfx import DrivingModel\n"
+            "from cfx.plugin import DrivingModel\n"
             "class Bad(DrivingModel):\n  kind = 'optimizer'\n  def next_speed(self, *a): pass",
             "says kind='optimizer'",
         ),
         (
-            "from cfx import DrivingModel\n"
+            "from cfx.plugin import DrivingModel\n"
             "class Bad(DrivingModel):\n  def next_speed(self, *a): pass",
-            "must be a cfx.ParameterSpace",
+            "must be a cfx.plugin.ParameterSpace",
         ),
         (
-            "from cfx import DrivingModel\n"
+            "from cfx.plugin import DrivingModel\n"
             "class Bad(DrivingModel):\n  parameters = ['tau']\n  def next_speed(self, *a): pass",
-            "must be a cfx.ParameterSpace, not list",
+            "must be a cfx.plugin.ParameterSpace, not list",
         ),
         (
-            "from cfx import DrivingModel, ParameterSpace\n"
+            "from cfx.plugin import DrivingModel, ParameterSpace\n"
             "class Bad(DrivingModel):\n  parameters = ParameterSpace.of()\n"
             "  def next_speed(self, *a): pass",
             "at least one of its parameters must be tuned",
         ),
         (
             "from cfx.models.krauss import Krauss\nclass Bad(Krauss):\n  schema = dict",
-            "its schema must be a subclass of cfx.Settings",
+            "its schema must be a subclass of cfx.plugin.Settings",
         ),
         (
-            "from cfx.models.krauss import Krauss\nfrom cfx import Settings\n"
+            "from cfx.models.krauss import Krauss\nfrom cfx.plugin import Settings\n"
             "class Bad(Krauss):\n  schema = Settings",
             "its schema must extend cfx.models.base.ModelSettings",
         ),

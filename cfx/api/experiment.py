@@ -227,20 +227,20 @@ def model(name: str) -> Callable[[type[M]], type[M]]:
 
     Raises:
         PluginError: an installed model has that name, or the class does not say what a model says
-            (`cfx.DrivingModel`).
+            (`cfx.plugin.DrivingModel`).
 
     Examples:
         >>> import cfx
         >>> @cfx.model("constant_gap")
-        ... class ConstantGap(cfx.DrivingModel):
+        ... class ConstantGap(cfx.plugin.DrivingModel):
         ...     "Approaches a gap that does not depend on speed."
-        ...     parameters = cfx.ParameterSpace.of(
-        ...         cfx.Parameter("s0", "m", 1.0, 50.0, 20.0, "gap"),
-        ...         cfx.Parameter("k", "1/s2", 0.01, 1.0, 0.1, "stiffness"),
+        ...     parameters = cfx.plugin.ParameterSpace.of(
+        ...         cfx.plugin.Parameter("s0", "m", 1.0, 50.0, 20.0, "gap"),
+        ...         cfx.plugin.Parameter("k", "1/s2", 0.01, 1.0, 0.1, "stiffness"),
         ...     )
         ...
         ...     def next_speed(self, follower, leader, p, dt):
-        ...         gap = cfx.bumper_gap(follower, leader)
+        ...         gap = cfx.plugin.bumper_gap(follower, leader)
         ...         approach = leader.speed - follower.speed
         ...         acceleration = p["k"] * (gap - p["s0"]) + approach
         ...         return (follower.speed + acceleration * dt).clamp(min=0.0)

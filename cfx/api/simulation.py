@@ -94,7 +94,7 @@ def simulate(
     """
     with visit():
         from cfx.models.base import DrivingModel, Leader
-        from cfx.simulation.rollout import simulate as rollout
+        from cfx.simulation.rollout import simulate_follower as rollout
         from cfx.simulation.trajectory import Start
 
         if isinstance(parameters, Fit) and parameters.model != model:

@@ -115,10 +115,10 @@ def losses_of(
     return torch.cat(parts)
 
 
-NEAR = 0.05
+NEARLY_BEST = 0.05
 """A loss that is higher than the best by no more than this share of it counts as nearly as good."""
 
-COLUMN = "flat_"
+FLAT_SHARE_PREFIX = "flat_"
 """Prefix of the columns of flat shares."""
 
 
@@ -130,7 +130,7 @@ def flat_shares(slices: pd.DataFrame) -> pd.DataFrame:
             or no number has none: NaN.
     """
     best = slices["best_loss"].where(np.isfinite(slices["best_loss"]) & (slices["best_loss"] > 0))
-    near = (slices["loss"] <= (1 + NEAR) * best).astype(float).where(best.notna())
+    near = (slices["loss"] <= (1 + NEARLY_BEST) * best).astype(float).where(best.notna())
     rows = slices[["pair_id", "parameter"]].assign(near=near)
     wide = rows.pivot_table(index="pair_id", columns="parameter", values="near")
     return wide.reindex(columns=slices["parameter"].unique())
@@ -147,7 +147,7 @@ def with_flat_shares(
     columns = {}
     for name in names:
         values = about["pair_id"].map(shares[name])
-        columns[f"{COLUMN}{name}"] = values.where(about["method"] == "fixed")
+        columns[f"{FLAT_SHARE_PREFIX}{name}"] = values.where(about["method"] == "fixed")
     return about.assign(**columns)
 
 
@@ -160,8 +160,8 @@ def flat_for(table: pd.DataFrame, names: Sequence[str]) -> dict[str, float]:
     """
     found = {}
     for name in names:
-        if f"{COLUMN}{name}" in table:
-            known = table[f"{COLUMN}{name}"].dropna()
+        if f"{FLAT_SHARE_PREFIX}{name}" in table:
+            known = table[f"{FLAT_SHARE_PREFIX}{name}"].dropna()
             if len(known):
                 found[name] = float((known == 1).mean())
     return found

@@ -45,7 +45,7 @@ _LOSSES_AT_ONCE = 1 << 19
 class CandidateLosses(Protocol):
     """The losses of candidates in P independent problems, which an optimizer minimises.
 
-    In a calibration these are values of the job's objective (`cfx.Objective`), in its unit.
+    In a calibration these are values of the job's objective (`cfx.plugin.Objective`), in its unit.
     """
 
     @property

@@ -14,13 +14,13 @@ from cfx.core.component import Settings
 if TYPE_CHECKING:
     import pandas as pd
 
-LEVEL = 0.9
+INTERVAL_LEVEL = 0.9
 """Probability of an interval."""
 
-DETERMINED = 0.3
+MIN_NARROWING = 0.3
 """A recording determines a parameter where its interval is narrower than a priori by this share."""
 
-RELIABLE = 0.7
+MAX_PARETO_K = 0.7
 """Pareto k of weighted samples above which an interval is not to be relied on (Vehtari et al. 2024,
 *Pareto smoothed importance sampling*)."""
 
@@ -77,7 +77,7 @@ class CalibrationSettings(Settings):
         return self
 
 
-def reliable(rows: pd.DataFrame) -> pd.Series:
+def are_reliable(rows: pd.DataFrame) -> pd.Series:
     """Returns which drivers' intervals are to be relied on.
 
     Args:
@@ -85,4 +85,4 @@ def reliable(rows: pd.DataFrame) -> pd.Series:
     """
     if "r_hat" in rows:
         return (rows["r_hat"] <= MIXED) & (rows["divergences"] <= DIVERGENT)
-    return rows["pareto_k"] <= RELIABLE
+    return rows["pareto_k"] <= MAX_PARETO_K

@@ -87,7 +87,7 @@ def blank_table(*columns: str, title: str | None = None) -> Table:
     return made
 
 
-def put(table: Table) -> None:
+def print_table(table: Table) -> None:
     """Prints a table; in a file or a pipe nothing is folded, so that lines stay whole for grep."""
     from rich.console import Console
 

@@ -628,7 +628,9 @@ def _check(found: Entry, cls: Any) -> None:
         )
     schema = cls.schema
     if not (inspect.isclass(schema) and issubclass(schema, Settings)):
-        raise PluginError(f"{found}: its schema must be a subclass of cfx.Settings, not {schema!r}")
+        raise PluginError(
+            f"{found}: its schema must be a subclass of cfx.plugin.Settings, not {schema!r}"
+        )
     if "name" in schema.model_fields:
         raise PluginError(
             f"{found}: its settings must not have a field 'name',"

@@ -280,7 +280,7 @@ class Dataset(Component):
         """Raises PluginError unless these are pairs of finite numbers."""
         if not isinstance(pairs, PairSet):
             raise PluginError(
-                f"{registry.origin(self)}: read must return a cfx.PairSet,"
+                f"{registry.origin(self)}: read must return a cfx.plugin.PairSet,"
                 f" but returned a {type(pairs).__name__}"
             )
         for pair in pairs:

@@ -76,7 +76,7 @@ def beginning(path: Path) -> FileStart:
     """
     if path.is_dir():
         return FileStart(path, b"", ())
-    start = magic(path)
+    start = first_bytes(path)
     if start.startswith(_ZIP):
         return FileStart(path, start, ())
     head = read_head(path)
@@ -94,7 +94,7 @@ def stem(path: Path) -> str:
     return path.name.split(".")[0] or path.name
 
 
-def magic(path: Path) -> bytes:
+def first_bytes(path: Path) -> bytes:
     """Returns the first bytes of a file.
 
     Raises:
@@ -121,7 +121,7 @@ def magic(path: Path) -> bytes:
 
 def open_text(path: Path) -> BinaryIO:
     """Opens a text file, unpacking gzip by its content, whatever its name."""
-    start = magic(path)
+    start = first_bytes(path)
     if start.startswith(_ZIP):
         raise DataError(f"{path}: is a zip archive; unpack it and set data.path to the file inside")
     if start.startswith(_GZIP):

@@ -27,7 +27,7 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cfx.data.files import PARQUET, Floats, Ints, magic, open_text, read_head, unpacking
+from cfx.data.files import PARQUET, Floats, Ints, first_bytes, open_text, read_head, unpacking
 from cfx.errors import DataError, first_line, listed, nearest
 
 if TYPE_CHECKING:
@@ -293,7 +293,7 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
         DataError: the file cannot be read, a column is missing, or a cell is wrong; the message
             names file, row and column.
     """
-    if magic(path) != PARQUET:
+    if first_bytes(path) != PARQUET:
         return _read_text(path, layout)
     if not layout.parquet:
         raise DataError(

@@ -12,7 +12,7 @@ from cfx.data.pairs import PairSet
 from cfx.evaluation.result import Evaluation
 from cfx.policies.agent import Agent
 
-PAGE = "demo.html"
+DEMO_PAGE = "demo.html"
 """A page of this name is what a user opens; the job says where it is."""
 
 

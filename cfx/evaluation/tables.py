@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.calibration.identifiability import COLUMN
+from cfx.calibration.identifiability import FLAT_SHARE_PREFIX
 from cfx.evaluation.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
 from cfx.simulation.trajectory import TRANSIENT_S
 
@@ -110,7 +110,7 @@ def wide_table(
     Columns besides those of `about`: METRIC, `steady_METRIC`, `full_trajectory_METRIC` and, of the
     recorded driver, `real_METRIC`; `improvement` over `fixed` and `improvement_over_BASELINE`.
     """
-    parameters = [name for name in about if str(name).startswith(("parameter_", COLUMN))]
+    parameters = [name for name in about if str(name).startswith(("parameter_", FLAT_SHARE_PREFIX))]
     columns: dict[str, pd.Series] = {}
     for scope in SCOPES:
         for metric in metrics:

@@ -22,7 +22,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from cfx.figures.text import EDGE, INK, PALE, colour_of, label, percent
+from cfx.figures.text import EDGE, INK, PALE, colour_of, method_label, percent
 
 Array = NDArray[np.float64]
 
@@ -270,7 +270,7 @@ def draw_lines(axes: Axes, lines: Sequence[Line]) -> None:
             drawstyle="steps-post" if line.steps else "default",
             zorder=2.0 + 0.05 * above,
         )
-        hover(drawn, label(method))
+        hover(drawn, method_label(method))
     axes.margins(x=0.01)
 
 
@@ -308,7 +308,7 @@ def method_handles(methods: Iterable[str]) -> list[Line2D]:
     handles = []
     for method in methods:
         handle = Line2D([], [], color=colour_of(method), linestyle=DASHES.get(method, "solid"))
-        handle.set(linewidth=points(_WIDTHS.get(method, 1.6) + 0.4), label=label(method))
+        handle.set(linewidth=points(_WIDTHS.get(method, 1.6) + 0.4), label=method_label(method))
         handles.append(handle)
     return handles
 
@@ -346,6 +346,6 @@ def percent_tick(value: float, _position: int) -> str:
     return percent(value) if value else "0 %"
 
 
-def say(axes: Axes, text: str) -> None:
+def write_note(axes: Axes, text: str) -> None:
     """Writes a sentence into an empty panel."""
     axes.text(0.5, 0.75, text, transform=axes.transAxes, ha="center", va="center", color=INK)

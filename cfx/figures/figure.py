@@ -158,7 +158,7 @@ def figure_named(name: str) -> registry.Installed[JobFigure]:
     raise DataError(message + (others if known else f" {where_figures_are()}"))
 
 
-def draw(one: registry.Installed[JobFigure], results: Results) -> Figure | None:
+def draw_figure(one: registry.Installed[JobFigure], results: Results) -> Figure | None:
     """Return a figure in the common look; None where there is nothing to show, or it fails."""
     from cfx.figures.canvas import figure_style
 
@@ -169,7 +169,7 @@ def draw(one: registry.Installed[JobFigure], results: Results) -> Figure | None:
     return one.attempt(attempt, None)
 
 
-METADATA: dict[str, dict[str, None]] = {
+FIGURE_METADATA: dict[str, dict[str, None]] = {
     "png": {"Software": None},
     "pdf": {"Creator": None, "Producer": None, "CreationDate": None},
     "svg": {"Creator": None, "Date": None},
@@ -199,7 +199,7 @@ def write_figures(
     for one in registry.installed("figure"):
         if names is not None and one.name not in names:
             continue
-        figure = draw(one, results)
+        figure = draw_figure(one, results)
         for form in ("png", "pdf", "svg"):
             path = folder / f"{one.name}.{form}"
             if figure is not None and form in formats:
@@ -225,7 +225,7 @@ def write_figure(figure: Figure, path: Path) -> Path:
         path.parent.mkdir(parents=True, exist_ok=True)
         with atomic_write(path) as unfinished, figure_style():
             form = path.suffix.removeprefix(".")
-            metadata: Any = METADATA[form]
+            metadata: Any = FIGURE_METADATA[form]
             figure.savefig(unfinished, format=form, metadata=metadata)
     except OSError as error:
         raise OutputError(
@@ -262,7 +262,7 @@ def drawn(name: str, results: Results) -> Figure:
     Raises:
         DataError: there is no such figure, or the results have nothing of what it shows.
     """
-    figure = draw(figure_named(name), results)
+    figure = draw_figure(figure_named(name), results)
     if figure is None:
         raise DataError(f"the job has nothing of what the figure '{name}' shows")
     return for_notebooks(figure)

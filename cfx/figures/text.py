@@ -97,7 +97,7 @@ TEST, STEADY, FULL_TRAJECTORY = SCOPES
 """Parts of trajectories that metrics are of."""
 
 
-def label(method: str) -> str:
+def method_label(method: str) -> str:
     """Returns how a legend names a method."""
     return METHOD_TEXTS[method].label if method in METHOD_TEXTS else method
 
@@ -122,7 +122,7 @@ def percent_or_undefined(fraction: float, digits: int = 0) -> str:
     return percent(fraction, digits) if math.isfinite(fraction) else "undefined"
 
 
-def number(value: float) -> str:
+def number_text(value: float) -> str:
     """Returns up to three significant digits, with a real minus sign."""
     return f"{value:.3g}".replace("-", MINUS)
 
@@ -145,7 +145,7 @@ def few_drivers(drivers: int) -> str:
     )
 
 
-def short(name: str, limit: int = 26) -> str:
+def shortened(name: str, limit: int = 26) -> str:
     """Returns a name that fits, its middle left out if it is longer than `limit` characters."""
     if len(name) <= limit:
         return name

@@ -129,7 +129,7 @@ class DrivingModel(Component):
         space = getattr(cls, "parameters", None)
         if not isinstance(space, ParameterSpace):
             return (
-                ": its attribute 'parameters' must be a cfx.ParameterSpace,"
+                ": its attribute 'parameters' must be a cfx.plugin.ParameterSpace,"
                 f" not {type(space).__name__}"
             )
         if not space.tuned and not space.open:

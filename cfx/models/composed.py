@@ -184,7 +184,7 @@ def for_both(
     return {**first, **renamed, WEIGHT.name: weight}
 
 
-TIME = Parameter(
+RELAXATION_TIME = Parameter(
     "residual_time",
     "s",
     0.2,
@@ -231,7 +231,7 @@ HANDOVER = Parameter(
     "on reconstructed I-80 it forecasts the next two seconds best",
 )
 
-RESIDUAL = (TIME, TARGET, JERK, JERK_TIME, HANDOVER)
+RESIDUAL = (RELAXATION_TIME, TARGET, JERK, JERK_TIME, HANDOVER)
 """The parameters of a residual, in order."""
 
 _WIDTH = 4
@@ -298,7 +298,7 @@ class WithResidual(Composed):
         jerk = self._remembered(follower, _JERK, p[JERK.name]) * torch.exp(-dt / p[JERK_TIME.name])
         held = self._remembered(follower, _HELD, follower.acceleration) + jerk * dt
         target = p[TARGET.name]
-        kept = torch.exp(-dt / p[TIME.name])
+        kept = torch.exp(-dt / p[RELAXATION_TIME.name])
         residual = target + (follower.memory[..., _RESIDUAL] - target) * kept
         passed = follower.memory[..., _PASSED] + dt
         inner = super().next_memory(follower, leader, p, dt, speed)
@@ -328,10 +328,10 @@ def _braked(both: Tensor, alone: Tensor, follower: Follower, leader: Leader) -> 
     return torch.where((gap < _TIGHT_M) & (difference >= 0.0), no_more, bounded)
 
 
-LIMIT = "speed_limit"
+SPEED_LIMIT = "speed_limit"
 """Name of the limit among the values that the model is given, m/s; infinity: there is none."""
 
-COMFORTABLE = 2.0
+COMFORTABLE_BRAKING = 2.0
 """m/s2: how hard a driver brakes who is faster than the limit."""
 
 
@@ -352,5 +352,5 @@ class WithSpeedLimit(Composed):
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:
         wanted = self.inner.next_speed(follower, leader, p, dt)
-        slowed = follower.speed - COMFORTABLE * dt
-        return torch.minimum(wanted, torch.maximum(p[LIMIT], slowed))
+        slowed = follower.speed - COMFORTABLE_BRAKING * dt
+        return torch.minimum(wanted, torch.maximum(p[SPEED_LIMIT], slowed))

@@ -23,19 +23,19 @@ Temperature = float | Tensor
 A 0-dimensional tensor may change while compiled code runs, and is never exact.
 """
 
-SPACING = 2.0
+SPACING_WIDTH = 2.0
 """m: how gradually a threshold of distance is crossed at temperature 1."""
 
-SPEED = 0.5
+SPEED_WIDTH = 0.5
 """m/s: the same for a threshold of relative speed."""
 
 
-def exact(temperature: Temperature) -> bool:
+def switches_exactly(temperature: Temperature) -> bool:
     """Says whether regimes switch exactly."""
     return not isinstance(temperature, Tensor) and temperature == 0
 
 
-def below(
+def where_below(
     value: Tensor,
     threshold: Tensor,
     yes: Tensor,
@@ -51,12 +51,12 @@ def below(
         scale: width of the transition at temperature 1, in the unit of `value`.
         temperature: how gradual; 0 is exact.
     """
-    if exact(temperature):
+    if switches_exactly(temperature):
         return torch.where(value < threshold, yes, no)
     return torch.lerp(no, yes, torch.sigmoid((threshold - value) / (scale * temperature)))
 
 
-def up_to(
+def where_up_to(
     value: Tensor,
     threshold: Tensor,
     yes: Tensor,
@@ -66,9 +66,9 @@ def up_to(
     temperature: Temperature = 0.0,
 ) -> Tensor:
     """As `below`, for `value <= threshold`."""
-    if exact(temperature):
+    if switches_exactly(temperature):
         return torch.where(value <= threshold, yes, no)
-    return below(value, threshold, yes, no, scale=scale, temperature=temperature)
+    return where_below(value, threshold, yes, no, scale=scale, temperature=temperature)
 
 
 def safe_sqrt(value: Tensor) -> Tensor:

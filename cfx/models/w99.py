@@ -19,7 +19,15 @@ from cfx.core.component import Settings
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader, ModelSettings, bumper_gap
-from cfx.models.regimes import SPACING, SPEED, below, exact, safe_divisor, safe_sqrt, up_to
+from cfx.models.regimes import (
+    SPACING_WIDTH,
+    SPEED_WIDTH,
+    safe_divisor,
+    safe_sqrt,
+    switches_exactly,
+    where_below,
+    where_up_to,
+)
 from cfx.models.vtype import VType, sumo_speed
 
 _VISSIM = "default: Vissim and SUMO; bounds: the ranges used in the calibration literature"
@@ -199,7 +207,7 @@ class W99(DrivingModel):
         )
         free = torch.where(dx > near, free, 0.0)
 
-        if not exact(self.temperature):
+        if not switches_exactly(self.temperature):
             # They are mixed, so each must be something that the vehicle can do.
             hardest = -p["b_max"]
             approaching = approaching.clamp(min=hardest).minimum(cap)
@@ -207,11 +215,13 @@ class W99(DrivingModel):
             free = free.clamp(min=hardest).minimum(cap)
         # Nested, not joined by `&`: compiled in float64 that is three times as fast (masks of
         # doubles are joined as integers).
-        near_by = partial(below, scale=SPACING, temperature=self.temperature)
-        slower = partial(below, scale=SPEED, temperature=self.temperature)
+        near_by = partial(where_below, scale=SPACING_WIDTH, temperature=self.temperature)
+        slower = partial(where_below, scale=SPEED_WIDTH, temperature=self.temperature)
         rest = slower(dv, opening_threshold, near_by(dx, far, following, free), free)
         rest = slower(dv, closing_threshold, near_by(dx, perceived, approaching, rest), rest)
-        too_near = up_to(dx, near, too_close, rest, scale=SPACING, temperature=self.temperature)
+        too_near = where_up_to(
+            dx, near, too_close, rest, scale=SPACING_WIDTH, temperature=self.temperature
+        )
         acceleration = slower(dv, opening_threshold, too_near, rest)
         wanted = v + acceleration * dt
         return sumo_speed(

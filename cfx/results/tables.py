@@ -16,14 +16,14 @@ from rich.text import Text
 
 from cfx.calibration.identifiability import flat_for
 from cfx.calibration.settings import (
-    DETERMINED,
     DIVERGENT,
     ENOUGH,
-    LEVEL,
+    INTERVAL_LEVEL,
+    MAX_PARETO_K,
+    MIN_NARROWING,
     MIXED,
     OFF,
-    RELIABLE,
-    reliable,
+    are_reliable,
 )
 from cfx.core.parameters import Parameter
 from cfx.data.style import INDICATORS, style_distances, styles_by_site
@@ -301,11 +301,11 @@ class KnownParameters:
     @property
     def reliable(self) -> pd.Series:
         """Whether a pair's intervals are to be relied on."""
-        return reliable(self.rows)
+        return are_reliable(self.rows)
 
     def determined(self, name: str) -> int:
         """Returns how many pairs' recordings determine a parameter, as far as that is known."""
-        return int(((self.rows[f"contraction_{name}"] >= DETERMINED) & self.reliable).sum())
+        return int(((self.rows[f"contraction_{name}"] >= MIN_NARROWING) & self.reliable).sum())
 
     def metrics(self) -> dict[str, float]:
         """Returns what MLflow keeps too.
@@ -328,7 +328,7 @@ class KnownParameters:
         pairs = len(self.rows)
         words = "" if pairs == 1 else f", median of {pairs} pairs"
         table = Table(
-            title=f"What the recordings say of parameters{words}: {LEVEL:.0%} intervals",
+            title=f"What the recordings say of parameters{words}: {INTERVAL_LEVEL:.0%} intervals",
             title_justify="left",
         )
         table.add_column("parameter")
@@ -350,7 +350,7 @@ class KnownParameters:
         if open_ones:
             sentences.append(
                 f"Hardly known after these recordings: {', '.join(open_ones)} of {pairs} pairs"
-                f" (intervals less than {DETERMINED:.0%} narrower than the prior's;"
+                f" (intervals less than {MIN_NARROWING:.0%} narrower than the prior's;"
                 " contraction_NAME in fits.parquet)."
             )
         left = float(self.rows["noise_left"].median())
@@ -369,7 +369,7 @@ class KnownParameters:
         doubtful = list(self.rows["pair_id"][~self.reliable])
         if doubtful:
             named = ", ".join(map(str, doubtful[:3])) + (" ..." if len(doubtful) > 3 else "")
-            why = f"samples of these posteriors do not settle (pareto_k above {RELIABLE}"
+            why = f"samples of these posteriors do not settle (pareto_k above {MAX_PARETO_K}"
             if "r_hat" in self.rows:
                 why = (
                     f"chains differ or leave out a part (r_hat above {MIXED} or divergences above"
@@ -384,11 +384,11 @@ class KnownParameters:
             )
         if "expected_coverage" in self.rows:
             held = float(self.rows["expected_coverage"].median())
-            if abs(held - LEVEL) > OFF:
+            if abs(held - INTERVAL_LEVEL) > OFF:
                 sentences.append(
                     f"Intervals of the network alone hold {held:.0%} of simulated drivers'"
-                    f" parameters instead of {LEVEL:.0%} (expected_coverage in fits.parquet): it"
-                    " has learned too little."
+                    f" parameters instead of {INTERVAL_LEVEL:.0%} (expected_coverage in"
+                    " fits.parquet): it has learned too little."
                 )
         few = int((self.reliable & (self.rows["effective_samples"] < ENOUGH)).sum())
         if few:

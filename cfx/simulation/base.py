@@ -19,9 +19,9 @@ from cfx.simulation.trajectory import Segments, Start, Terms
 class Stepper(ABC):
     """Advances followers of one model at one time step.
 
-    A simulator (`cfx.Simulator`) makes one for each job. Calibration, learning and evaluation call
-    `begin` once for each rollout and `advance` as often as parameters change; the job calls `close`
-    at its end.
+    A simulator (`cfx.plugin.Simulator`) makes one for each job. Calibration, learning and
+    evaluation call `begin` once for each rollout and `advance` as often as parameters change; the
+    job calls `close` at its end.
 
     Shapes: `*batch` are the followers' leading dimensions, K is a number of steps.
 

@@ -232,7 +232,7 @@ def can_compile(device: torch.device) -> bool:
 
 
 @same_environment()
-def simulate(
+def simulate_follower(
     model: DrivingModel,
     parameters: Tensor | Mapping[str, Tensor | float] | None,
     leader: Leader,

@@ -198,7 +198,7 @@ def _follow(
     import torch
 
     from cfx.models.base import Leader
-    from cfx.simulation.rollout import simulate
+    from cfx.simulation.rollout import simulate_follower
     from cfx.simulation.trajectory import Start
 
     acceleration = torch.from_numpy(differences(leader_speed.numpy(), s.dt))
@@ -206,7 +206,9 @@ def _follow(
     begin = leader_position[:, 0] - leader_length - 5.0 - 2.0 * leader_speed[:, 0]
     start = Start(begin, leader_speed[:, 0], torch.zeros_like(begin))
     # Never compiled: eager arithmetic gives the same bits wherever there is the same seed.
-    trajectory = simulate(model, parameters, leader, start, s.dt, window=hold, compile="never")
+    trajectory = simulate_follower(
+        model, parameters, leader, start, s.dt, window=hold, compile="never"
+    )
     if trajectory.collided.any():
         raise DataError(
             f"synthetic data: a driver of data.model={s.model} collides with seed {s.seed};"

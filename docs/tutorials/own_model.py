@@ -22,20 +22,20 @@ pairs = cfx.read(dataset="synthetic", pairs=3 if SMOKE else 8, frames=300 if SMO
 
 # %%
 @cfx.model("optimal_velocity")
-class OptimalVelocity(cfx.DrivingModel):
+class OptimalVelocity(cfx.plugin.DrivingModel):
     """Relaxes to a speed that depends on the gap, and follows the leader's speed."""
 
-    parameters = cfx.ParameterSpace.of(
-        cfx.Parameter("v0", "m/s", 5.0, 40.0, 20.0, "desired speed"),
-        cfx.Parameter("T", "s", 0.3, 4.0, 1.2, "time gap"),
-        cfx.Parameter("s0", "m", 0.5, 8.0, 2.0, "gap at standstill"),
-        cfx.Parameter("tau", "s", 0.3, 10.0, 2.0, "relaxation time"),
-        cfx.Parameter("gain", "1/s", 0.0, 2.0, 0.5, "response to the relative speed"),
+    parameters = cfx.plugin.ParameterSpace.of(
+        cfx.plugin.Parameter("v0", "m/s", 5.0, 40.0, 20.0, "desired speed"),
+        cfx.plugin.Parameter("T", "s", 0.3, 4.0, 1.2, "time gap"),
+        cfx.plugin.Parameter("s0", "m", 0.5, 8.0, 2.0, "gap at standstill"),
+        cfx.plugin.Parameter("tau", "s", 0.3, 10.0, 2.0, "relaxation time"),
+        cfx.plugin.Parameter("gain", "1/s", 0.0, 2.0, 0.5, "response to the relative speed"),
     )
 
     def next_speed(self, follower, leader, p, dt):
         """Returns the speed after a time step."""
-        gap = cfx.bumper_gap(follower, leader)
+        gap = cfx.plugin.bumper_gap(follower, leader)
         optimal = ((gap - p["s0"]) / p["T"]).clamp(min=0.0).minimum(p["v0"])
         pull = (optimal - follower.speed) / p["tau"]
         acceleration = pull + p["gain"] * (leader.speed - follower.speed)

@@ -23,10 +23,12 @@ def define(pull: float) -> type[DrivingModel]:
     """Defines the model `mine`, as a cell of a notebook does."""
 
     @cfx.model("mine")
-    class Mine(cfx.DrivingModel):
+    class Mine(cfx.plugin.DrivingModel):
         """Approaches a gap."""
 
-        parameters = cfx.ParameterSpace.of(cfx.Parameter("s0", "m", 1.0, 50.0, 20.0, "gap"))
+        parameters = cfx.plugin.ParameterSpace.of(
+            cfx.plugin.Parameter("s0", "m", 1.0, 50.0, 20.0, "gap")
+        )
 
         def next_speed(
             self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
@@ -64,8 +66,10 @@ def test_an_installed_name_and_a_broken_class_are_refused() -> None:
     with pytest.raises(PluginError, match=r"model=idm means it; choose another name"):
         cfx.model("idm")(define(0.1))
 
-    class Empty(cfx.DrivingModel):
-        parameters = cfx.ParameterSpace.of(cfx.Parameter("s0", "m", 1.0, 50.0, 20.0, "gap"))
+    class Empty(cfx.plugin.DrivingModel):
+        parameters = cfx.plugin.ParameterSpace.of(
+            cfx.plugin.Parameter("s0", "m", 1.0, 50.0, 20.0, "gap")
+        )
 
     with pytest.raises(PluginError, match="does not implement next_speed"):
         cfx.model("empty")(Empty)

@@ -30,7 +30,7 @@ from cfx.core import registry
 from cfx.data.pairs import SIGNALS, Pair, PairBatch, PairSet
 from cfx.data.signals import resampled
 from cfx.models.base import DrivingModel, Leader
-from cfx.simulation.rollout import MemoryStepper, simulate
+from cfx.simulation.rollout import MemoryStepper, simulate_follower
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.trajectory import Start
 
@@ -90,7 +90,7 @@ def driven(model: DrivingModel) -> tuple[PairSet, Tensor]:
     start = Start(
         batch.follower_position[:, 0], batch.follower_speed[:, 0], batch.follower_acceleration[:, 0]
     )
-    out = simulate(model, parameters, leader, start, DT)
+    out = simulate_follower(model, parameters, leader, start, DT)
     pairs = []
     for pair, speed, gap in zip(made, out.speed.numpy(), out.gap.numpy(), strict=True):
         position = pair.leader_position - pair.leader_length - gap

@@ -25,7 +25,7 @@ from scoringrules import crps_ensemble
 from torch import Tensor
 
 from cfx.calibration.random_search import RandomSearch
-from cfx.calibration.settings import DETERMINED, MIXED, RELIABLE, CalibrationSettings
+from cfx.calibration.settings import MAX_PARETO_K, MIN_NARROWING, MIXED, CalibrationSettings
 from cfx.calibration.shards import Solver
 from cfx.core.registry import create
 from cfx.data.pairs import PairBatch
@@ -151,7 +151,7 @@ def recording(name: str) -> Iterator[str]:
         spent = time.process_time() - started
         rows = []
         for column, parameter in enumerate(found.names):
-            known = float((found.contraction[:, column] >= DETERMINED).double().mean())
+            known = float((found.contraction[:, column] >= MIN_NARROWING).double().mean())
             low = float(found.low[:, column].median())
             high = float(found.high[:, column].median())
             rows.append(f"{parameter} {known:.0%} ({low:.2g} to {high:.2g})")
@@ -313,12 +313,12 @@ def learned(name: str) -> Iterator[str]:
     """Yields how often 90 % intervals of networks hold the truth, of groups of eight drivers."""
     groups = [learned_group(name, seed) for seed in SEEDS[name]]
     whole = Group(*(torch.cat(values) for values in zip(*groups, strict=True)))
-    good, both = whole.pareto_k <= RELIABLE, torch.maximum(whole.pareto_k, whole.weighted_k)
-    off = whole.off[both <= RELIABLE]
+    good, both = whole.pareto_k <= MAX_PARETO_K, torch.maximum(whole.pareto_k, whole.weighted_k)
+    off = whole.off[both <= MAX_PARETO_K]
     yield (
         f"{type(MODELS[name]).__name__}: {len(good)} drivers, {float(whole.seconds.sum()):.0f} CPU"
         f" s, k below 0.7 {float(good.double().mean()):.0%} (weighted samples"
-        f" {float((whole.weighted_k <= RELIABLE).double().mean()):.0%}), the networks alone hold"
+        f" {float((whole.weighted_k <= MAX_PARETO_K).double().mean()):.0%}), the networks alone hold"
         f" {float(whole.coverage.mean()):.0%} of simulated ones; apart from weighted samples where"
         f" both settle {float(off.mean()):.2f} deviations, 99 % below"
         f" {float(off.flatten().quantile(0.99)):.2f}"

@@ -14,7 +14,7 @@ from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
 from cfx.models.krauss import Krauss
 from cfx.simulation.kernel import run as kernel
-from cfx.simulation.rollout import MemoryStepper, simulate
+from cfx.simulation.rollout import MemoryStepper, simulate_follower
 from cfx.simulation.trajectory import Start
 from tests.drives import wavy_pairs
 
@@ -66,7 +66,7 @@ def loss_of(
         batch.follower_speed[p, first],
         batch.follower_acceleration[p, first],
     )
-    simulated = simulate(model, parameters, leader, start, 0.1)
+    simulated = simulate_follower(model, parameters, leader, start, 0.1)
     speed, gap = batch.follower_speed[p, frames], batch.gap[p, frames]
     values = FrameValues(simulated.speed[1:], simulated.gap[1:], speed[1:], gap[1:], 0.1)
     return objective(values, torch.ones(len(speed) - 1))

@@ -10,7 +10,7 @@ import pytest
 from cfx.core.contract import Check, NotApplicable
 from cfx.data.pairs import PairSet
 from cfx.errors import DataError
-from cfx.evaluation.demo import PAGE, Demo
+from cfx.evaluation.demo import DEMO_PAGE, Demo
 from cfx_contracts import check_contract
 from cfx_contracts import demos as checks
 
@@ -18,8 +18,8 @@ from cfx_contracts import demos as checks
 class Page(Demo):
     def write(self, folder: Path, *results: Any) -> list[Path]:
         assert (folder.with_name("policy") / "policy.json").is_file()
-        (folder / PAGE).write_text("a page")
-        return [folder / PAGE]
+        (folder / DEMO_PAGE).write_text("a page")
+        return [folder / DEMO_PAGE]
 
 
 def test_one_that_writes_a_page_holds_it() -> None:

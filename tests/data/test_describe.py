@@ -83,7 +83,7 @@ def test_a_file_that_cannot_be_used_says_why(tmp_path: Path) -> None:
 
 MINE = """
 import numpy as np
-from cfx import Dataset, Pair, PairSet
+from cfx.plugin import Dataset, Pair, PairSet
 from cfx.data.base import FileDatasetSettings
 
 

@@ -15,7 +15,7 @@ from cfx.models.base import DrivingModel, Leader
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx.simulation.rollout import simulate
+from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.synthetic import SyntheticDataset, leader_speed, smooth_noise
 from cfx.simulation.trajectory import Start, Trajectory
 
@@ -50,7 +50,7 @@ def driven_again(pair: Pair) -> Trajectory:
             for x in (pair.follower_position, pair.follower_speed, pair.follower_acceleration)
         )
     )
-    return simulate(model, parameters, leader, start, pair.dt, window=hold)
+    return simulate_follower(model, parameters, leader, start, pair.dt, window=hold)
 
 
 @pytest.mark.parametrize("model", MODELS)

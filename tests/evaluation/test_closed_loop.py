@@ -22,7 +22,7 @@ from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.base import DirectHead
-from cfx.simulation.rollout import MemoryStepper, simulate
+from cfx.simulation.rollout import MemoryStepper, simulate_follower
 from cfx.simulation.trajectory import Start
 from cfx.simulation.windows import WindowSettings
 from tests.drives import wavy_pairs
@@ -107,7 +107,7 @@ def test_constant_parameters_are_the_plain_rollout() -> None:
         batch.follower_speed[:, 150],
         batch.follower_acceleration[:, 150],
     )
-    plain = simulate(model, parameters, leader, start, 0.1)
+    plain = simulate_follower(model, parameters, leader, start, 0.1)
     torch.testing.assert_close(loop.speed, plain.speed)
     torch.testing.assert_close(loop.gap, plain.gap)
     torch.testing.assert_close(loop.parameters, parameters[:, None].expand_as(loop.parameters))

@@ -87,7 +87,7 @@ def unrendered(figure: Figure, file: Path, **options: object) -> None:
 
 def job(folder: Path, faults: Faults, monkeypatch: pytest.MonkeyPatch) -> int:
     with monkeypatch.context() as patched:
-        patched.setattr(cfx.figures.figure, "draw", undrawn)
+        patched.setattr(cfx.figures.figure, "draw_figure", undrawn)
         patched.setattr(Figure, "savefig", unrendered)
         for module in MODULES:
             patched.setattr(module, "atomic_write", faults.atomic_write)

@@ -6,7 +6,7 @@ import torch
 import cfx
 from cfx.models.base import Leader
 from cfx.models.direct import Direct
-from cfx.simulation.rollout import simulate
+from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.trajectory import Start
 
 
@@ -21,7 +21,7 @@ def drive(acceleration: float, seconds: float, leader_speed: float = 12.0) -> li
         torch.tensor([5.0]).double(),
     )
     zero = torch.zeros(1).double()
-    found = simulate(
+    found = simulate_follower(
         Direct(), torch.tensor([[acceleration]]).double(), leader, Start(zero, zero + 10, zero), 0.1
     )
     return [float(v) for v in found.speed[0, ::10]]

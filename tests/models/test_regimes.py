@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
-from cfx.models.regimes import below, up_to
+from cfx.models.regimes import where_below, where_up_to
 from cfx.models.w99 import W99
 from cfx_community.models.w74 import W74
 
@@ -18,10 +18,10 @@ numbers = st.floats(-50.0, 50.0)
 def test_without_softness_the_choice_is_exact(value: float, threshold: float) -> None:
     yes, no = torch.tensor([1.0, 2.0], dtype=torch.float64)
     v, t = torch.tensor([value, threshold], dtype=torch.float64)
-    assert float(below(v, t, yes, no, scale=1.0, temperature=0.0)) == (
+    assert float(where_below(v, t, yes, no, scale=1.0, temperature=0.0)) == (
         1.0 if value < threshold else 2.0
     )
-    assert float(up_to(v, t, yes, no, scale=1.0, temperature=0.0)) == (
+    assert float(where_up_to(v, t, yes, no, scale=1.0, temperature=0.0)) == (
         1.0 if value <= threshold else 2.0
     )
 
@@ -34,7 +34,7 @@ def test_a_soft_choice_is_the_logistic_mixture(
     v, t = torch.tensor([value, threshold], dtype=torch.float64)
     weight = torch.sigmoid((t - v) / (2.0 * temperature))
     torch.testing.assert_close(
-        below(v, t, yes, no, scale=2.0, temperature=temperature), 2.0 - weight
+        where_below(v, t, yes, no, scale=2.0, temperature=temperature), 2.0 - weight
     )
 
 

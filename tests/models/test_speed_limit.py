@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from cfx.models.base import Follower, Leader
-from cfx.models.composed import COMFORTABLE, LIMIT, WithSpeedLimit
+from cfx.models.composed import COMFORTABLE_BRAKING, SPEED_LIMIT, WithSpeedLimit
 from cfx.models.idm import IDM
 from cfx.models.w99 import W99
 
@@ -23,13 +23,13 @@ def test_nobody_exceeds_the_limit_and_who_is_faster_slows_down() -> None:
     follower, leader = _states(0)
     p = model.space.unpack(model.space.defaults())
     free = model.next_speed(follower, leader, p, 0.1)
-    p[LIMIT] = torch.tensor([8.0, 8.0, 6.0, 6.0]).double()
+    p[SPEED_LIMIT] = torch.tensor([8.0, 8.0, 6.0, 6.0]).double()
     limited = WithSpeedLimit(model).next_speed(follower, leader, p, 0.1)
     assert limited[0] == free[0]
     assert limited[1] == 8.0
-    assert limited[2] == 15.0 - COMFORTABLE * 0.1
+    assert limited[2] == 15.0 - COMFORTABLE_BRAKING * 0.1
     # Whom the leader makes brake harder than the limit does brakes as hard as before.
-    assert limited[3] == free[3] < 15.0 - COMFORTABLE * 0.1
+    assert limited[3] == free[3] < 15.0 - COMFORTABLE_BRAKING * 0.1
 
 
 def test_without_a_limit_it_is_the_model_itself() -> None:
@@ -37,7 +37,7 @@ def test_without_a_limit_it_is_the_model_itself() -> None:
         around = WithSpeedLimit(model)
         follower, leader = _states(model.memory_size)
         p = model.space.unpack(model.space.defaults())
-        p[LIMIT] = torch.full((4,), torch.inf).double()
+        p[SPEED_LIMIT] = torch.full((4,), torch.inf).double()
         speed = model.next_speed(follower, leader, p, 0.1)
         assert torch.equal(around.next_speed(follower, leader, p, 0.1), speed)
         memory = model.next_memory(follower, leader, p, 0.1, speed)

@@ -12,7 +12,7 @@ from cfx_sumo.krauss import KraussSumo
 
 def test_krauss_sumo_keeps_its_time_gap_behind_a_steady_leader() -> None:
     from cfx.models.base import Leader
-    from cfx.simulation.rollout import simulate
+    from cfx.simulation.rollout import simulate_follower
     from cfx.simulation.trajectory import Start
 
     time = torch.arange(3000, dtype=torch.float64) * 0.1
@@ -21,7 +21,7 @@ def test_krauss_sumo_keeps_its_time_gap_behind_a_steady_leader() -> None:
         15.0 * time, speed, torch.zeros_like(time), torch.tensor(5.0, dtype=torch.float64)
     )
     start = Start(*(torch.tensor(x, dtype=torch.float64) for x in (-80.0, 15.0, 0.0)))
-    gap = simulate(KraussSumo(), {"tau": 1.4}, leader, start, 0.1).gap[-1]
+    gap = simulate_follower(KraussSumo(), {"tau": 1.4}, leader, start, 0.1).gap[-1]
     assert gap.item() == pytest.approx(2.5 + 1.4 * 15.0, abs=0.01)
 
 

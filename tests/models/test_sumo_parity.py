@@ -24,7 +24,7 @@ from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.krauss import Krauss
 from cfx.models.vtype import InSumo, VType
 from cfx.models.w99 import W99
-from cfx.simulation.rollout import simulate
+from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.trajectory import Start, Trajectory
 from cfx_community.models.w74 import W74
 from cfx_sumo.idm import IdmSumo
@@ -254,7 +254,7 @@ def ours(
     )
     with torch.no_grad():
         values = parameters(cases)
-        return simulate(model, values, leader, start, DT, outside="allow"), leader
+        return simulate_follower(model, values, leader, start, DT, outside="allow"), leader
 
 
 def parameters(cases: list[Drive]) -> dict[str, Tensor]:

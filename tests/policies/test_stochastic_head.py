@@ -14,14 +14,14 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter
 from cfx.models.base import DrivingModel
-from cfx.models.composed import HANDOVER, JERK, TARGET, TIME
+from cfx.models.composed import HANDOVER, JERK, RELAXATION_TIME, TARGET
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.features import History
-from cfx.policies.heads.stochastic import PARAMETER_TIME, SCALE, StochasticHead
+from cfx.policies.heads.stochastic import NOISE_SCALE, PARAMETER_TIME, StochasticHead
 from cfx.policies.valid_range import ValidRange
 from tests.agents import adaptive
 
@@ -68,7 +68,7 @@ def steady(count: int, length: int = 5) -> History:
 def test_the_residual_is_an_ar_process_of_the_scale_that_the_network_says() -> None:
     """Mean, standard deviation and correlation from window to window, in the long run."""
     time, target, scale = 1.5, 0.3, 0.4
-    chosen = parameters(4_000, (TIME, time), (TARGET, target), (SCALE, scale))
+    chosen = parameters(4_000, (RELAXATION_TIME, time), (TARGET, target), (NOISE_SCALE, scale))
     kept = math.exp(-WINDOW_S / time)
     generator = torch.Generator().manual_seed(0)
     residual, latent = torch.zeros(4_000).double(), unseen(4_000)
@@ -226,7 +226,7 @@ def test_an_agent_draws_only_from_a_generator_and_the_same_from_the_same_seed() 
     assert not torch.equal(act(agent, state, 4)[0], sampled)
     for name in ("t_r", TARGET.name):
         assert len(sampled[:, column(name)].unique()) == 3, "each driver has noise of their own"
-    time = column(TIME.name)
+    time = column(RELAXATION_TIME.name)
     assert torch.equal(sampled[:, time], centre[:, time])
     assert len(after.latent.unique()) == 9
 

@@ -360,16 +360,16 @@ def test_a_library_is_built_once_and_found_again(
 ) -> None:
     monkeypatch.setenv("CFX_KERNEL_CACHE", str(tmp_path / "kernels"))
     compiler.cache_folder.cache_clear()
-    compiler.build.cache_clear()
+    compiler.build_library.cache_clear()
     source = 'extern "C" long answer() { return 42; }\n'
-    library = compiler.build(source)
+    library = compiler.build_library(source)
     assert library is not None
     assert library.answer() == 42
     files = list((tmp_path / "kernels").iterdir())
     assert [path.suffix for path in files] == [".so"]
     written = files[0].stat().st_mtime_ns
-    compiler.build.cache_clear()
-    assert compiler.build(source) is not None
+    compiler.build_library.cache_clear()
+    assert compiler.build_library(source) is not None
     assert files[0].stat().st_mtime_ns == written
     compiler.cache_folder.cache_clear()
 
@@ -387,7 +387,7 @@ def test_a_cache_that_others_may_write_to_is_not_used(
 
 
 def test_source_that_does_not_compile_gives_no_library() -> None:
-    assert compiler.build("this is no C++") is None
+    assert compiler.build_library("this is no C++") is None
 
 
 @pytest.mark.parametrize("value", [0.1, -1e-300, 3.0, float("inf"), True])

@@ -15,7 +15,7 @@ from cfx.models.base import DrivingModel, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation import rollout
-from cfx.simulation.rollout import MemoryStepper, can_compile, simulate
+from cfx.simulation.rollout import MemoryStepper, can_compile, simulate_follower
 from cfx.simulation.trajectory import Start, Trajectory
 from cfx_community.models.w74 import W74
 
@@ -64,7 +64,7 @@ def assert_same(one: Trajectory, other: Trajectory, tolerance: float = 1e-9) -> 
 @each_model
 def test_it_integrates_by_forward_euler(model: DrivingModel) -> None:
     leader = wavy_leader(2, 40)
-    out = simulate(model, None, leader, start_of((2,)), DT)
+    out = simulate_follower(model, None, leader, start_of((2,)), DT)
     assert out.speed.shape == (2, 40)
     torch.testing.assert_close(out.position[:, 1:], out.position[:, :-1] + out.speed[:, 1:] * DT)
     torch.testing.assert_close(out.gap, leader.position - 5.0 - out.position)
@@ -74,11 +74,11 @@ def test_it_integrates_by_forward_euler(model: DrivingModel) -> None:
 def test_a_batch_equals_the_loop(model: DrivingModel) -> None:
     leader, p = wavy_leader(3, 60), candidates(model, 3, 4)
     wide = Leader(*(x[:, None] for x in leader))
-    together = simulate(model, p, wide, start_of((3, 4)), DT)
+    together = simulate_follower(model, p, wide, start_of((3, 4)), DT)
     for i in range(3):
         alone_behind = Leader(*(x[i] for x in leader))
         for k in range(4):
-            alone = simulate(model, p[i, k], alone_behind, start_of(()), DT)
+            alone = simulate_follower(model, p[i, k], alone_behind, start_of(()), DT)
             assert_same(Trajectory(*(x[i, k] for x in together)), alone)
 
 
@@ -86,9 +86,9 @@ def test_a_batch_equals_the_loop(model: DrivingModel) -> None:
 def test_leading_dimensions_broadcast(model: DrivingModel) -> None:
     p = candidates(model, 4)
     leader = wavy_leader(1, 30)
-    out = simulate(model, p, Leader(*(x[0] for x in leader)), start_of(()), DT)
+    out = simulate_follower(model, p, Leader(*(x[0] for x in leader)), start_of(()), DT)
     assert out.speed.shape == (4, 30)
-    full = simulate(
+    full = simulate_follower(
         model, p, Leader(*(x.expand(4, *x.shape[1:]) for x in leader)), start_of((4,)), DT
     )
     assert_same(out, full)
@@ -98,7 +98,7 @@ def test_leading_dimensions_broadcast(model: DrivingModel) -> None:
 def test_parameters_per_window(model: DrivingModel) -> None:
     leader, windows = wavy_leader(2, 24), 4
     p = candidates(model, 2, windows)
-    out = simulate(model, p, leader, start_of((2,)), DT, window=5)
+    out = simulate_follower(model, p, leader, start_of((2,)), DT, window=5)
     simulator = MemoryStepper(model, DT, compile="never")
     follower, speeds = simulator.begin(start_of((2,))), []
     for k in range(23):  # the last window's parameters are kept for the rest
@@ -110,17 +110,19 @@ def test_parameters_per_window(model: DrivingModel) -> None:
     torch.testing.assert_close(out.speed[:, 1:], torch.cat(speeds).T)
     same = p[:, :1].expand(2, windows, -1)
     assert_same(
-        simulate(model, same, leader, start_of((2,)), DT, window=5),
-        simulate(model, p[:, 0], leader, start_of((2,)), DT),
+        simulate_follower(model, same, leader, start_of((2,)), DT, window=5),
+        simulate_follower(model, p[:, 0], leader, start_of((2,)), DT),
     )
 
 
 def test_parameters_by_name_leave_the_others_at_their_defaults() -> None:
     model, leader = Krauss(), wavy_leader(2, 30)
-    defaults = simulate(model, None, leader, start_of((2,)), DT)
-    assert_same(simulate(model, {"t_r": 1.5}, leader, start_of((2,)), DT), defaults)
-    assert_same(simulate(model, model.space.defaults(), leader, start_of((2,)), DT), defaults)
-    each = simulate(
+    defaults = simulate_follower(model, None, leader, start_of((2,)), DT)
+    assert_same(simulate_follower(model, {"t_r": 1.5}, leader, start_of((2,)), DT), defaults)
+    assert_same(
+        simulate_follower(model, model.space.defaults(), leader, start_of((2,)), DT), defaults
+    )
+    each = simulate_follower(
         model, {"t_r": torch.tensor([1.5, 3.0], dtype=torch.float64)}, leader, start_of((2,)), DT
     )
     torch.testing.assert_close(each.speed[0], defaults.speed[0])
@@ -130,13 +132,13 @@ def test_parameters_by_name_leave_the_others_at_their_defaults() -> None:
 def test_a_user_s_mistakes_are_named() -> None:
     model, leader, start = Krauss(), wavy_leader(2, 10), start_of((2,))
     with pytest.raises(ParameterError, match=r"unknown parameter 'tr'. Did you mean 't_r'"):
-        simulate(model, {"tr": 1.0}, leader, start, DT)
+        simulate_follower(model, {"tr": 1.0}, leader, start, DT)
     with pytest.raises(ParameterError, match="expected 2 parameters"):
-        simulate(model, torch.ones(2, 3), leader, start, DT)
+        simulate_follower(model, torch.ones(2, 3), leader, start, DT)
     with pytest.raises(ParameterError, match="window=0"):
-        simulate(model, candidates(model, 2, 3), leader, start, DT, window=0)
+        simulate_follower(model, candidates(model, 2, 3), leader, start, DT, window=0)
     with pytest.raises(ParameterError, match="got no window"):
-        simulate(model, torch.ones(2, 0, 2), leader, start, DT, window=5)
+        simulate_follower(model, torch.ones(2, 0, 2), leader, start, DT, window=5)
 
 
 def ragged(lengths: tuple[int, ...]) -> PairSet:
@@ -185,13 +187,13 @@ def drive(model: DrivingModel, batch: PairBatch) -> Trajectory:
         batch.follower_speed[:, 0],
         batch.follower_acceleration[:, 0],
     )
-    return simulate(model, None, leader, Start(*first), batch.dt)
+    return simulate_follower(model, None, leader, Start(*first), batch.dt)
 
 
 @each_model
 def test_single_precision_stays_near_double(model: DrivingModel) -> None:
-    double = simulate(model, candidates(model, 3), wavy_leader(3, 60), start_of((3,)), DT)
-    single = simulate(
+    double = simulate_follower(model, candidates(model, 3), wavy_leader(3, 60), start_of((3,)), DT)
+    single = simulate_follower(
         model,
         candidates(model, 3, dtype=torch.float32),
         wavy_leader(3, 60, torch.float32),
@@ -210,7 +212,7 @@ def test_collisions_are_reported_and_the_drive_goes_on() -> None:
         torch.tensor([5.0]).double(),
     )
     zero = torch.zeros(1, dtype=torch.float64)
-    out = simulate(W74(), None, leader, Start(zero, zero + 20.0, zero), DT)
+    out = simulate_follower(W74(), None, leader, Start(zero, zero + 20.0, zero), DT)
     assert not out.collided[0, 0]
     assert out.collided[0, -1]
     assert torch.equal(out.collided, out.gap < 0)
@@ -221,14 +223,14 @@ def test_collisions_are_reported_and_the_drive_goes_on() -> None:
 @each_model
 def test_nan_parameters_do_not_reach_the_neighbours(model: DrivingModel) -> None:
     p, leader = candidates(model, 3), wavy_leader(3, 30)
-    clean = simulate(model, p, leader, start_of((3,)), DT)
+    clean = simulate_follower(model, p, leader, start_of((3,)), DT)
     p[1] = torch.nan
-    out = simulate(model, p, leader, start_of((3,)), DT)
+    out = simulate_follower(model, p, leader, start_of((3,)), DT)
     assert_same(Trajectory(*(x[[0, 2]] for x in out)), Trajectory(*(x[[0, 2]] for x in clean)))
 
 
 def test_a_recording_of_one_frame_is_its_start() -> None:
-    out = simulate(Krauss(), None, wavy_leader(2, 1), start_of((2,)), DT)
+    out = simulate_follower(Krauss(), None, wavy_leader(2, 1), start_of((2,)), DT)
     assert out.speed.tolist() == [[8.0], [8.0]]
 
 
@@ -238,7 +240,7 @@ def test_gradients_flow_through_the_drive() -> None:
     near = start_of((2,))._replace(position=leader.position[:, 0] - 12.0)
 
     def final(p: Tensor) -> Tensor:
-        return simulate(model, p, leader, near, DT, window=4).speed
+        return simulate_follower(model, p, leader, near, DT, window=4).speed
 
     p = (
         torch.tensor([[0.8, 0.2], [1.2, 0.1], [2.0, 0.4]], dtype=torch.float64)
@@ -259,7 +261,7 @@ def test_gradients_stay_finite_through_standstill_and_contact(model: DrivingMode
         leader.position[..., 0] - 5.0 - gaps, zero + torch.tensor([0.0, 0.0, 3.0, 12.0]), zero
     )
     p = candidates(model, 3, 4).requires_grad_()
-    speed = simulate(model, p, leader, start, DT).speed
+    speed = simulate_follower(model, p, leader, start, DT).speed
     assert torch.autograd.grad(speed.square().sum(), p)[0].isfinite().all()
 
 
@@ -275,9 +277,9 @@ def test_tiles_change_nothing(
         leader.length[sensitivity[:-1]] if batch else leader.length[0],
     )
     p = candidates(model, *batch)
-    whole = simulate(model, p, leader, start_of(batch), DT)
+    whole = simulate_follower(model, p, leader, start_of(batch), DT)
     monkeypatch.setattr(rollout, "tile_size", lambda like: 4)
-    tiled = simulate(model, p, leader, start_of(batch), DT)
+    tiled = simulate_follower(model, p, leader, start_of(batch), DT)
     assert all(torch.equal(a, b) for a, b in zip(whole, tiled, strict=True))
 
 
@@ -337,8 +339,8 @@ def test_compiled_equals_eager_and_shapes_do_not_recompile(monkeypatch: pytest.M
             leader, p = wavy_leader(batch[0], frames), candidates(model, *batch)
             if len(batch) == 2:
                 leader = Leader(*(x[:, None] for x in leader))
-            eager = simulate(model, p, leader, start_of(batch), DT, compile="never")
-            compiled = simulate(Krauss(), p, leader, start_of(batch), DT, compile="always")
+            eager = simulate_follower(model, p, leader, start_of(batch), DT, compile="never")
+            compiled = simulate_follower(Krauss(), p, leader, start_of(batch), DT, compile="always")
             assert_same(eager, compiled)
     assert len(rollout._COMPILED) == 2, (
         "one function for a block of five steps, one for the steps left over"
@@ -349,7 +351,7 @@ def test_compiled_equals_eager_and_shapes_do_not_recompile(monkeypatch: pytest.M
 
 def test_gradients_bypass_the_compiler() -> None:
     p = candidates(Krauss(), 2).requires_grad_()
-    out = simulate(Krauss(), p, wavy_leader(2, 8), start_of((2,)), DT, compile="always")
+    out = simulate_follower(Krauss(), p, wavy_leader(2, 8), start_of((2,)), DT, compile="always")
     assert out.speed.requires_grad
     assert not rollout._COMPILED
 
@@ -368,9 +370,10 @@ def test_without_pythons_headers_nothing_is_compiled(
 def test_without_a_compiler_it_runs_eagerly(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(rollout.shutil, "which", lambda name: None)
     assert not can_compile(torch.device("cpu"))
-    out = simulate(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="always")
+    out = simulate_follower(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="always")
     assert_same(
-        out, simulate(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="never")
+        out,
+        simulate_follower(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="never"),
     )
     assert not rollout._COMPILED
 
@@ -379,8 +382,8 @@ def test_without_a_compiler_it_runs_eagerly(monkeypatch: pytest.MonkeyPatch) -> 
 @each_model
 def test_cuda_agrees_with_the_cpu(model: DrivingModel) -> None:
     leader, p = wavy_leader(3, 60), candidates(model, 3)
-    cpu = simulate(model, p, leader, start_of((3,)), DT)
-    cuda = simulate(
+    cpu = simulate_follower(model, p, leader, start_of((3,)), DT)
+    cuda = simulate_follower(
         model, p.cuda(), wavy_leader(3, 60, device="cuda"), start_of((3,), device="cuda"), DT
     )
     assert cuda.speed.device.type == "cuda"
@@ -397,13 +400,13 @@ def test_parameters_outside_their_bounds_are_refused_unless_asked_for(
     leader = Leader(position, speed, speed * 0, torch.tensor(4.5))
     start = Start(*(torch.tensor(value, dtype=torch.float64) for value in (0.0, 10.0, 0.0)))
     with pytest.raises(ParameterError, match="is outside its bounds"):
-        simulate(W99(), parameters, leader, start, 0.1)
-    allowed = simulate(W99(), parameters, leader, start, 0.1, outside="allow")
+        simulate_follower(W99(), parameters, leader, start, 0.1)
+    allowed = simulate_follower(W99(), parameters, leader, start, 0.1, outside="allow")
     assert bool(allowed.speed.isfinite().all())
     values = W99().space.defaults(dtype=torch.float64)
     values[4] = 0.5
     with pytest.raises(ParameterError, match=r"cc4=0\.5 is outside its bounds, -2 to -0\.01 m/s"):
-        simulate(W99(), values, leader, start, 0.1)
+        simulate_follower(W99(), values, leader, start, 0.1)
     bounds = W99().space.bounds(dtype=torch.float64)
     for edge in bounds:
-        simulate(W99(), edge, leader, start, 0.1)
+        simulate_follower(W99(), edge, leader, start, 0.1)

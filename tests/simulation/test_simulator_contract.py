@@ -34,7 +34,7 @@ QUICK = [
 ]
 
 HALVING = """
-    from cfx import Simulator
+    from cfx.plugin import Simulator
     from cfx.simulation.rollout import MemoryStepper
 
     class Mine(Simulator):
@@ -57,7 +57,7 @@ def values_of(*overrides: str) -> dict[str, Any]:
 
 
 def test_it_is_the_public_name_and_memory_the_default() -> None:
-    assert cfx.Simulator is Simulator
+    assert cfx.plugin.Simulator is Simulator
     assert cfx.get("simulator", "memory") is MemorySimulator
     made = registry.create("simulator", JobConfig.of(values_of()).simulator)
     assert isinstance(made, MemorySimulator)
@@ -102,7 +102,7 @@ def test_a_broken_simulator_is_found_before_any_work(
     returned: str, complaint: str, install: Any
 ) -> None:
     text = f"""
-        from cfx import Simulator
+        from cfx.plugin import Simulator
         from cfx.simulation.rollout import MemoryStepper
 
         class Unnamed(MemoryStepper):

@@ -15,7 +15,7 @@ from pydantic_core import to_jsonable_python
 from cfx.app.completion import add_kind, complete_with
 from cfx.core import registry
 from cfx.core.command import Command
-from cfx.core.console import blank_table, put
+from cfx.core.console import blank_table, print_table
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -58,7 +58,7 @@ def overview() -> None:
             now = _state(entry)
             states.add(now)
             rows.add_row(kind, entry.name, entry.distribution, entry.version, entry.location, now)
-    put(rows)
+    print_table(rows)
     if states & {"broken", "shadowed"}:
         print("cfx plugins check says what is wrong, and what to do.")
 
@@ -95,7 +95,7 @@ def show(kind: str, name: str) -> None:
         print(f"Unit: {cls.unit or 'none'}\n")
     about = {"model": _parameters, "metric": _metric, "table": _columns}.get(entry.kind)
     if about is not None:
-        put(about(cls))
+        print_table(about(cls))
     title = f"Settings (set with {group}.SETTING=VALUE)"
     settings = blank_table("setting", "default", "values", "meaning", title=title)
     settings.columns[0].no_wrap = True
@@ -103,7 +103,7 @@ def show(kind: str, name: str) -> None:
         if entry.kind != "model" or row[0] != "parameters":
             settings.add_row(*row)
     if settings.row_count:
-        put(settings)
+        print_table(settings)
     else:
         print("It has no settings.")
 

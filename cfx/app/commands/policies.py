@@ -36,7 +36,7 @@ class PoliciesCommand(Command):
 
 
 def _overview() -> None:
-    from cfx.core.console import blank_table, put
+    from cfx.core.console import blank_table, print_table
 
     table = blank_table(
         "policy",
@@ -59,7 +59,7 @@ def _overview() -> None:
             f"{card['size_kb']} kB",
             card["summary"],
         )
-    put(table)
+    print_table(table)
     print(
         "A policy's card: cfx policies show NAME. Drive with it: cfx drive --drivers car=cfx://NAME"
     )

@@ -13,9 +13,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cfx.calibration.identifiability import NEAR, flat_for
+from cfx.calibration.identifiability import NEARLY_BEST, flat_for
 from cfx.errors import without_passwords
-from cfx.evaluation.demo import PAGE
+from cfx.evaluation.demo import DEMO_PAGE
 from cfx.evaluation.headline import headline
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
@@ -77,7 +77,7 @@ def report_places(
     lines = [f"Results: {folder}"]
     if copied_to is not None:
         lines.append(f"Copied to: {copied_to}")
-    for page in sorted(folder.glob(f"*/{PAGE}")):
+    for page in sorted(folder.glob(f"*/{DEMO_PAGE}")):
         lines.append(f"Demonstration, for any browser: {page}")
     _say([*lines, *tracker.how_to_open()], console, markup=False)
 
@@ -218,8 +218,9 @@ def _safety(evaluation: Evaluation, metrics: Mapping[str, float]) -> list[str]:
     found = [f"{name} for {share * pairs:.0f}" for name, share in shares.items() if share > 0]
     if found:
         lines.append(
-            f"Not determined: {', '.join(found)} of {pairs} pairs (within {100 * NEAR:.0f} % of the"
-            " best loss from bound to bound; flat_NAME is 1 in pairs.csv)."
+            f"Not determined: {', '.join(found)} of {pairs} pairs (within"
+            f" {100 * NEARLY_BEST:.0f} % of the best loss from bound to bound;"
+            " flat_NAME is 1 in pairs.csv)."
         )
     return lines
 

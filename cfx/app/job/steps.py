@@ -348,7 +348,7 @@ def find(context: ProtocolContext, parts: Parts, calibration: CalibrationSetting
         result: object = parts.protocol.run(context)
         if not isinstance(result, ProtocolResult):
             raise PluginError(
-                f"{registry.origin(parts.protocol)}: run must return a cfx.ProtocolResult,"
+                f"{registry.origin(parts.protocol)}: run must return a cfx.plugin.ProtocolResult,"
                 f" but returned a {type(result).__name__}"
             )
         purpose = Purpose.of(parts.model, parts.policy)

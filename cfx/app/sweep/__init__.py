@@ -36,7 +36,7 @@ from omegaconf.errors import OmegaConfBaseException
 from cfx.app.hydra_source import resolving
 from cfx.app.sweep import summary
 from cfx.app.sweep.folder import LOCK, RECORD, JobStatus, Record, command_of, find_folder
-from cfx.core.console import put
+from cfx.core.console import print_table
 
 log = logging.getLogger(__name__)
 
@@ -119,7 +119,7 @@ class Sweep:
         lines = self._close_runs()
         table = summary.rows(statuses)
         summary.write_summary(self.folder / summary.SUMMARY, table)
-        put(summary.summary_table(table, summary.metric_columns(list(statuses))))
+        print_table(summary.summary_table(table, summary.metric_columns(list(statuses))))
         said = verdict(against_the_best(summary.errors_of(statuses)))
         if said:
             print(said)

@@ -250,7 +250,7 @@ class ProtocolContext:
         who = registry.origin(self.learner if policy.trainable else policy)
         if not isinstance(training_result, TrainingResult):
             raise PluginError(
-                f"{who}: fit must return a cfx.TrainingResult, but returned a"
+                f"{who}: fit must return a cfx.plugin.TrainingResult, but returned a"
                 f" {type(training_result).__name__}"
             )
         head = self._head(policy, training_result)

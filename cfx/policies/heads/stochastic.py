@@ -47,11 +47,11 @@ from torch import Tensor
 
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.models.base import DrivingModel
-from cfx.models.composed import HANDOVER, RESIDUAL, TARGET, TIME, WithResidual
+from cfx.models.composed import HANDOVER, RELAXATION_TIME, RESIDUAL, TARGET, WithResidual
 from cfx.policies.heads.offset import step_of
 from cfx.policies.heads.residual import ResidualHead
 
-SCALE = Parameter(
+NOISE_SCALE = Parameter(
     "residual_scale",
     "m/s2",
     0.001,
@@ -96,11 +96,13 @@ class StochasticHead(ResidualHead):
         space = WithResidual(model).adaptation_space
         scales = [_scale_of(parameter, 0.3) for parameter in model.adaptation_space.tuned]
         scales.append(_scale_of(HANDOVER, 0.5))
-        return cls(replace(space, parameters=(*space, SCALE, PARAMETER_TIME, *scales)), device)
+        return cls(
+            replace(space, parameters=(*space, NOISE_SCALE, PARAMETER_TIME, *scales)), device
+        )
 
     def of_acceleration(self) -> Self:
         """Returns the head of constant parameters: with noise on the acceleration alone."""
-        end = self._names().index(SCALE.name) + 1
+        end = self._names().index(NOISE_SCALE.name) + 1
         space = replace(self.space, parameters=self.space.parameters[:end])
         return type(self)(space, self._low.device)
 
@@ -124,8 +126,8 @@ class StochasticHead(ResidualHead):
     def _with_acceleration(self, parameters: Tensor, noise: Tensor, window_s: float) -> Tensor:
         """Draws where the residual acceleration goes, from noise `(*batch,)`."""
         names = self.space.names
-        time = parameters[..., names.index(TIME.name)]
-        scale = parameters[..., names.index(SCALE.name)]
+        time = parameters[..., names.index(RELAXATION_TIME.name)]
+        scale = parameters[..., names.index(NOISE_SCALE.name)]
         kept = torch.exp(-window_s / time)
         step = scale * torch.sqrt((1.0 + kept) / (1.0 - kept)) * noise
         target = names.index(TARGET.name)

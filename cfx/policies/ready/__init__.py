@@ -15,13 +15,13 @@ from cfx.errors import DataError, nearest
 
 SCHEME = "cfx://"
 
-FOLDER = Path(__file__).resolve().parent / "policies"
+READY_FOLDER = Path(__file__).resolve().parent / "policies"
 
 
 def names() -> tuple[str, ...]:
     """Returns the names of all ready-made policies, sorted."""
     found = []
-    for card in FOLDER.glob("*/card.json"):
+    for card in READY_FOLDER.glob("*/card.json"):
         found.append(card.parent.name)
     return tuple(sorted(found))
 
@@ -44,7 +44,7 @@ def folder_of_ready_made(text: str) -> Path:
             f"{text}: there is no ready-made policy '{name}'.{nearest(name, known)}"
             f" cfx policies lists them: {', '.join(known)}."
         )
-    return FOLDER / name
+    return READY_FOLDER / name
 
 
 def card_of(name: str) -> dict[str, Any]:

@@ -60,7 +60,7 @@ def find_compiler() -> str | None:
 
 
 @functools.lru_cache(maxsize=64)
-def build(source: str, *options: str) -> ctypes.CDLL | None:
+def build_library(source: str, *options: str) -> ctypes.CDLL | None:
     """Returns the library built from C++ source; None where it cannot be built.
 
     Args:

@@ -99,7 +99,7 @@ class Elementwise:
         Raises:
             Unsupported: the compiler fails.
         """
-        library = compiler.build(self.source)
+        library = compiler.build_library(self.source)
         if library is None:
             raise Unsupported("the C++ compiler fails")
         return library

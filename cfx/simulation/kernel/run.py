@@ -189,7 +189,7 @@ def _made(model: DrivingModel, terms: Terms, key: KernelKey) -> _Kernel | None:
     if compiler.find_compiler() is None:
         return None
     source = compiler.remembered(key.lasting(), lambda: _source(model, terms, key))
-    library = compiler.build(source) if source else None
+    library = compiler.build_library(source) if source else None
     if library is None:
         return None
     return _Kernel(library.accumulate, int(library.terms()))

@@ -147,7 +147,7 @@ class Calls:
     """
 
     def __init__(self) -> None:
-        library = compiler.build(_SOURCE, *_OPTIONS)
+        library = compiler.build_library(_SOURCE, *_OPTIONS)
         if library is None:
             raise Unsupported("there is no C++ compiler")
         self._run = library.run

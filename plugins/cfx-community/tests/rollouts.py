@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from scipy.integrate import solve_ivp
 
-from cfx import DrivingModel, Leader, Start
-from cfx.simulation.rollout import simulate
+from cfx.plugin import DrivingModel, Leader, Start
+from cfx.simulation.rollout import simulate_follower
 
 LENGTH = 5.0
 MEAN, SWING, PACE = 14.0, 3.0, 0.25  # the leader's speed is MEAN + SWING sin(PACE t), m/s
@@ -41,7 +41,7 @@ def stepped(
         *(torch.tensor([value], dtype=torch.float64) for value in (-LENGTH - gap, speed, 0.0))
     )
     values = {name: torch.tensor(value, dtype=torch.float64) for name, value in p.items()}
-    return simulate(model, values, leader, begin, dt).speed[0].numpy()
+    return simulate_follower(model, values, leader, begin, dt).speed[0].numpy()
 
 
 def integrated(

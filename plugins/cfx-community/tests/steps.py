@@ -8,8 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, Start
-from cfx.simulation.rollout import simulate
+from cfx.plugin import DrivingModel, Follower, Leader, Start
+from cfx.simulation.rollout import simulate_follower
 
 LENGTH = 5.0
 
@@ -48,6 +48,8 @@ def gain(
     v_l = speed[:, None] + swing * torch.sin(pace * t)
     x_l = speed[:, None] * t + swing / pace * (1 - torch.cos(pace * t))
     leader = Leader(x_l, v_l, torch.zeros_like(v_l), torch.full_like(speed, LENGTH))
-    out = simulate(model, p, leader, Start(-LENGTH - gap, speed, torch.zeros_like(speed)), dt)
+    out = simulate_follower(
+        model, p, leader, Start(-LENGTH - gap, speed, torch.zeros_like(speed)), dt
+    )
     last = out.speed[:, -round(period / dt) :]
     return (last.amax(dim=1) - last.amin(dim=1)) / (2 * swing)

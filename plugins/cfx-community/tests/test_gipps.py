@@ -10,8 +10,8 @@ import torch
 from scipy.optimize import brentq
 from torch import Tensor
 
-from cfx import Leader, Start
-from cfx.simulation.rollout import simulate
+from cfx.plugin import Leader, Start
+from cfx.simulation.rollout import simulate_follower
 from cfx_community.models.gipps import Gipps
 from cfx_contracts.models import keeps_its_equilibrium
 
@@ -88,7 +88,7 @@ def test_a_follower_settles_at_the_closed_form_of_the_gap() -> None:
         torch.zeros(1, frames).double(),
         number(5.0)[None],
     )
-    out = simulate(
+    out = simulate_follower(
         Gipps(), None, leader, Start(number(-60.0)[None], number(5.0)[None], number(0.0)[None]), 0.1
     )
     assert out.speed[0, -1].item() == pytest.approx(12.0, abs=1e-6)

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 import cfx
-from cfx import DrivingModel, Follower, Leader, Start
 from cfx.errors import ConfigError
-from cfx.simulation.rollout import simulate
+from cfx.plugin import DrivingModel, Follower, Leader, Start
+from cfx.simulation.rollout import simulate_follower
 from cfx_community.models.gipps import Gipps
 from cfx_community.models.gipps_delay import GippsDelay
 from cfx_contracts.models import keeps_its_equilibrium
@@ -85,7 +85,7 @@ def loop_in_plain_python(leader: Leader, dt: float, tau: float) -> list[float]:
 @pytest.mark.parametrize("tau", [0.3, 0.45, TAU, 1.0, 1.37, 2.0])
 def test_it_drives_as_a_loop_in_plain_python_does(tau: float) -> None:
     leader = leader_of(0.1, 600)
-    out = simulate(GippsDelay(), {"tau": tau}, leader, start(), 0.1)
+    out = simulate_follower(GippsDelay(), {"tau": tau}, leader, start(), 0.1)
     wanted = torch.tensor(loop_in_plain_python(leader, 0.1, tau), dtype=torch.float64)
     torch.testing.assert_close(out.speed[0], wanted, rtol=0, atol=1e-9)
 
@@ -93,14 +93,14 @@ def test_it_drives_as_a_loop_in_plain_python_does(tau: float) -> None:
 def test_a_reaction_time_of_a_step_or_less_is_no_delay() -> None:
     for dt, tau in ((TAU, TAU), (0.8, 0.8), (0.8, 0.3)):
         leader = leader_of(dt, 80)
-        without = simulate(Gipps(), {"tau": tau}, leader, start(), dt)
-        delayed = simulate(GippsDelay(), {"tau": tau}, leader, start(), dt)
+        without = simulate_follower(Gipps(), {"tau": tau}, leader, start(), dt)
+        delayed = simulate_follower(GippsDelay(), {"tau": tau}, leader, start(), dt)
         torch.testing.assert_close(delayed.speed, without.speed)
 
 
 def test_speeds_that_lie_a_reaction_time_apart_obey_the_papers_equation() -> None:
     parts = 5
-    out = simulate(
+    out = simulate_follower(
         GippsDelay(shortest_step_s=TAU / parts),
         None,
         leader_of(TAU / parts, 300),
@@ -122,7 +122,9 @@ def test_it_answers_a_braking_leader_after_the_reaction_time(
     calm = leader_of(0.1, 200)
     braked = calm._replace(speed=calm.speed.clone())
     braked.speed[0, 100] = 0.0
-    speeds = [simulate(model, {"tau": 1.0}, one, start(), 0.1).speed[0] for one in (calm, braked)]
+    speeds = [
+        simulate_follower(model, {"tau": 1.0}, one, start(), 0.1).speed[0] for one in (calm, braked)
+    ]
     differs = (speeds[0] - speeds[1]).abs() > 1e-9
     assert int(differs.nonzero()[0]) == 100 + frames
 
@@ -134,7 +136,7 @@ def test_compiled_steps_carry_the_memory_as_eager_ones_do() -> None:
     at = GippsDelay().space.defaults().expand(7, -1).clone()
     at[:, :1] = taus
     eager, compiled = (
-        simulate(GippsDelay(), at, leader, start(), 0.1, compile=mode)
+        simulate_follower(GippsDelay(), at, leader, start(), 0.1, compile=mode)
         for mode in ("never", "always")
     )
     torch.testing.assert_close(compiled.speed, eager.speed)
@@ -166,7 +168,7 @@ def test_a_delay_beyond_the_memory_is_refused_with_what_to_write() -> None:
         GippsDelay(parameters={"tau": {"high": 3.0}})
     assert GippsDelay(max_delay_s=3.0, parameters={"tau": {"high": 3.0}}).memory_size == 91
     with pytest.raises(ConfigError, match=r"write model\.shortest_step_s=0\.04"):
-        simulate(GippsDelay(), None, leader_of(0.04, 10), start(), 0.04)
+        simulate_follower(GippsDelay(), None, leader_of(0.04, 10), start(), 0.04)
 
 
 @pytest.mark.slow

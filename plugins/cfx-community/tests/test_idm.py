@@ -17,8 +17,8 @@ import torch
 from torch import Tensor
 
 import cfx
-from cfx import Follower, Leader, Start
-from cfx.simulation.rollout import simulate
+from cfx.plugin import Follower, Leader, Start
+from cfx.simulation.rollout import simulate_follower
 from cfx_community.models.iidm import IIDM
 from cfx_contracts import check_contract
 
@@ -33,7 +33,7 @@ def number(value: float) -> Tensor:
 
 
 def acceleration(
-    model: cfx.DrivingModel, *, gap: float, v: float, v_l: float, **changes: float
+    model: cfx.plugin.DrivingModel, *, gap: float, v: float, v_l: float, **changes: float
 ) -> float:
     """Returns dv/dt as a very short step shows it."""
     p = {name: number(value) for name, value in (PAPER | changes).items()}
@@ -65,7 +65,7 @@ def test_the_defaults_are_the_papers() -> None:
 
 
 @pytest.mark.parametrize("model", [IDM(), IIDM()])
-def test_limits_that_the_paper_states(model: cfx.DrivingModel) -> None:
+def test_limits_that_the_paper_states(model: cfx.plugin.DrivingModel) -> None:
     # From standstill on a free road: a. At v0 on a free road: 0.
     assert acceleration(model, gap=1e6, v=0.0, v_l=0.0) == pytest.approx(0.73, abs=1e-6)
     assert acceleration(model, gap=1e6, v=120 / 3.6, v_l=120 / 3.6) == pytest.approx(0.0, abs=1e-6)
@@ -218,7 +218,7 @@ def test_idm_is_sumos() -> None:
         column[name] = torch.tensor(values, dtype=torch.float64)
     leader = Leader(ahead, v_l, torch.zeros_like(v_l), torch.full_like(gap, 5.0))
     start = Start(ahead[:, 0] - 5.0 - gap, v_l[:, 0], torch.zeros_like(gap))
-    mine = simulate(IDM(limits=None), column, leader, start, 0.1)
+    mine = simulate_follower(IDM(limits=None), column, leader, start, 0.1)
     assert not bool(mine.collided.any())
     assert (mine.speed.diff(dim=1) < -0.3).any(), "the leaders must make it brake"
     difference = (mine.speed - speed).abs()

@@ -9,8 +9,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from cfx import Leader, Start
-from cfx.simulation.rollout import simulate
+from cfx.plugin import Leader, Start
+from cfx.simulation.rollout import simulate_follower
 from cfx_community.models.newell import Newell
 from cfx_contracts.models import keeps_its_equilibrium
 
@@ -36,7 +36,7 @@ def stop_and_go(dt: float, frames: int) -> Leader:
 def test_with_steps_of_tau_it_is_the_papers_translated_path() -> None:
     leader = stop_and_go(TAU, 60)
     start = Start(number(-LENGTH - D - 8.0 * TAU)[None], number(8.0)[None], number(0.0)[None])
-    out = simulate(Newell(), None, leader, start, TAU)
+    out = simulate_follower(Newell(), None, leader, start, TAU)
     torch.testing.assert_close(out.position[:, 1:], leader.position[:, :-1] - LENGTH - D)
 
 
@@ -46,7 +46,7 @@ def test_behind_an_accelerating_leader_the_gap_is_smaller_by_half_a_tau_squared(
     leader = Leader(
         (a * t * t / 2)[None], (a * t)[None], torch.full_like(t, a)[None], number(LENGTH)[None]
     )
-    out = simulate(
+    out = simulate_follower(
         Newell(),
         None,
         leader,

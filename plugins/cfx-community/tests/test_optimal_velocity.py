@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 from torch import Tensor
 
 import cfx
-from cfx import DrivingModel, Leader, Start
-from cfx.simulation.rollout import simulate
+from cfx.plugin import DrivingModel, Leader, Start
+from cfx.simulation.rollout import simulate_follower
 from cfx_community.models.fvdm import FVDM
 from cfx_community.models.ovm import OVM
 from cfx_contracts import check_contract
@@ -156,7 +156,9 @@ def test_steps_converge_to_the_differential_equation_with_order_one(model: Drivi
         )
         start = Start(number(-LENGTH - gap)[None], number(speed)[None], number(0.0)[None])
         mine = (
-            simulate(model, {name: number(value) for name, value in p.items()}, leader, start, dt)
+            simulate_follower(
+                model, {name: number(value) for name, value in p.items()}, leader, start, dt
+            )
             .speed[0]
             .numpy()
         )

@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 
 from cfx.models.base import Follower, Leader
-from cfx.simulation.rollout import simulate
+from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.trajectory import Start
 from cfx_community.models.w74 import W74
 
@@ -86,7 +86,9 @@ def test_below_abx_it_brakes_in_proportion_to_what_is_lacking() -> None:
 def test_behind_a_steady_leader_it_swings_between_the_thresholds() -> None:
     time = torch.arange(3500, dtype=torch.float64) * 0.1
     leader = Leader(V * time, torch.full_like(time, V), torch.zeros_like(time), number(L))
-    out = simulate(W74(), None, leader, Start(number(-80.0), number(15.0), number(0.0)), 0.1)
+    out = simulate_follower(
+        W74(), None, leader, Start(number(-80.0), number(15.0), number(0.0)), 0.1
+    )
     spacing = (out.gap + L)[1500:]
     assert spacing.min() > ABX - 0.5
     assert spacing.max() < SDX + 0.5

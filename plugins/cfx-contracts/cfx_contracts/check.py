@@ -14,7 +14,7 @@ from cfx.app.completion import add_kind, complete_with
 from cfx.core import registry
 from cfx.core.command import Command
 from cfx.core.component import API_VERSION
-from cfx.core.console import blank_table, console_logging, put
+from cfx.core.console import blank_table, console_logging, print_table
 from cfx.core.contract import violations
 from cfx.core.distributions import OWN
 from cfx.core.progress import Task
@@ -85,7 +85,7 @@ def check(kind: str | None = None, name: str | None = None) -> int:
         rows.add_row(
             entry.kind, entry.name, entry.distribution, entry.version, entry.location, one.state
         )
-    put(rows)
+    print_table(rows)
     for hint in dict.fromkeys(one.hint for one in verdicts if one.hint):
         print(f"Hint: {hint}")
     complaints = dict.fromkeys(one.complaint for one in verdicts if one.complaint)

@@ -107,7 +107,7 @@ def delivers_networks_that_are_ready_to_drive(learner: Learner) -> None:
         data = training_data(needs_labels=learner.needs_labels, together=together)
         result = _fitted(learner, data)
         assert isinstance(result, TrainingResult), (
-            f"`fit` must return a cfx.TrainingResult, not a {type(result).__name__}"
+            f"`fit` must return a cfx.plugin.TrainingResult, not a {type(result).__name__}"
         )
         networks, members = len(data.names), 1
         wanted = str(networks)

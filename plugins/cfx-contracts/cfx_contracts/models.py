@@ -26,7 +26,7 @@ from cfx.models.contract import (
     ordinary,
     require_equations,
 )
-from cfx.simulation.rollout import simulate
+from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.trajectory import Start
 from cfx_contracts import contract_of
 
@@ -259,7 +259,7 @@ def no_rollout_leaves_what_is_finite(model: DrivingModel) -> None:
     leader = _stop_and_go(torch.tensor(25.0, dtype=torch.float64), 6.0)
     zero = torch.zeros(256, dtype=torch.float64)
     start = Start(zero - LENGTH - 60 * torch.rand(256, generator=draw).double(), zero + 25.0, zero)
-    out = simulate(model, model.space.from_unit(corner), leader, start, DT)
+    out = simulate_follower(model, model.space.from_unit(corner), leader, start, DT)
     assert bool(out.speed.isfinite().all()), (
         "a rollout at a corner of the bounds ends in infinity or NaN, and optimizers visit every"
         " corner"
@@ -295,7 +295,7 @@ def collision_free_as_claimed(model: DrivingModel, leader_deceleration: float = 
     leader = _stop_and_go(speed, leader_deceleration)
     headway = torch.tensor([1.8, 3.0, 6.0], dtype=torch.float64)[:, None]
     start = Start(-LENGTH - 3.0 - headway * speed, speed, torch.zeros_like(speed))
-    hit = simulate(model, None, leader, start, DT).collided.any(dim=-1)
+    hit = simulate_follower(model, None, leader, start, DT).collided.any(dim=-1)
     assert not bool(hit.any()), (
         "the model claims `collision_free`, but with default parameters it hits a leader"
         " that brakes at "
@@ -373,7 +373,7 @@ def _largest_changes(model: DrivingModel) -> dict[str, float]:
     speed = top * (0.5 + 0.7 * torch.rand(_BEHIND, generator=draw).double())
     start = Start(-LENGTH - gap, speed, torch.zeros_like(speed))
     with torch.no_grad():
-        out = simulate(model, model.space.from_unit(moved), leader, start, DT).speed
+        out = simulate_follower(model, model.space.from_unit(moved), leader, start, DT).speed
     change = (out - out[:, :1]).abs().flatten(1).amax(1)
     return dict(zip(model.space.names, change.tolist(), strict=True))
 

@@ -75,7 +75,7 @@ def context(
 def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
     protocol_result = _protocol_result(protocol)
     assert isinstance(protocol_result, ProtocolResult), (
-        f"`run` must return a cfx.ProtocolResult, not a {type(protocol_result).__name__}"
+        f"`run` must return a cfx.plugin.ProtocolResult, not a {type(protocol_result).__name__}"
     )
     for one in protocol_result.evaluation.trajectories:
         where = f"(pair {one.pair_id})"

@@ -10,10 +10,10 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 import cfx_drivers.gym
-from cfx import PairBatch, PairSet
 from cfx.errors import ConfigError, DataError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.models.krauss import Krauss
+from cfx.plugin import PairBatch, PairSet
 from cfx.simulation.rollout import MemoryStepper
 from cfx_drivers.gym.vector import COLLISION, CarFollowingVectorEnv, Outcome
 from tests.agents import adaptive

@@ -20,8 +20,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.forecasts import Origins, Paths
+from cfx.plugin import Origins, PairBatch, PairSet, Paths
 
 Array = NDArray[np.float64]
 

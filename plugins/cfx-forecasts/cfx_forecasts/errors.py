@@ -14,10 +14,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.forecasts import Origins, Paths, extrapolated
-from cfx.evaluation.result import FORECAST
-from cfx.evaluation.statistics import mean_interval
+from cfx.plugin import FORECAST, Origins, PairBatch, PairSet, Paths, extrapolated, mean_interval
 
 SCOPE = FORECAST
 """The scope of forecasts in the long table, and what their metrics begin with."""

@@ -9,13 +9,18 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cfx.evaluation.result import PairTrajectory
-from cfx.figures.canvas import (
+from cfx.plugin import (
     DASHES,
+    EDGE,
     HIDDEN,
+    INK,
     Array,
+    JobFigure,
     Line,
+    PairTrajectory,
+    Results,
     canvas,
+    colour_of,
     draw_lines,
     logarithmic,
     mark_points,
@@ -23,8 +28,6 @@ from cfx.figures.canvas import (
     side_by_side,
     styled,
 )
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import EDGE, INK, colour_of
 from cfx_forecasts.distributions import (
     LEVEL,
     centre_errors,

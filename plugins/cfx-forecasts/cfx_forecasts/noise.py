@@ -11,16 +11,20 @@ import torch
 from torch import Tensor
 
 from cfx.errors import ConfigError
-from cfx.evaluation.protocols.base import ProtocolContext
-from cfx.evaluation.protocols.held_out import HeldOut
-from cfx.models.composed import TIME
-from cfx.policies.agent import Agent
-from cfx.policies.base import ConstantNetwork
-from cfx.policies.constant import FixedPolicy
-from cfx.policies.core import AgentCore, features_read
-from cfx.policies.features import Scaler
-from cfx.policies.heads.stochastic import SCALE, StochasticHead
-from cfx.simulation.base import Stepper
+from cfx.plugin import (
+    NOISE_SCALE,
+    RELAXATION_TIME,
+    Agent,
+    AgentCore,
+    ConstantNetwork,
+    FixedPolicy,
+    HeldOut,
+    ProtocolContext,
+    Scaler,
+    Stepper,
+    StochasticHead,
+    features_read,
+)
 from cfx_forecasts.residuals import measure_residuals
 
 log = logging.getLogger(__name__)
@@ -38,7 +42,7 @@ def residual_noise(test: HeldOut, parameters: Tensor, *, own: bool) -> tuple[Ten
     model, windows = test.context.simulator.model, test.context.windows
     lag = windows.stride * test.batch.dt
     found = measure_residuals(model, test.batch, parameters, test.first, lag)
-    usual = found.time.nanmean().nan_to_num(TIME.default)
+    usual = found.time.nanmean().nan_to_num(RELAXATION_TIME.default)
     time = torch.where(found.time.isnan(), usual, found.time)
     if own:
         return time, found.scale
@@ -66,7 +70,7 @@ def constant_with_noise(
     model, device = context.simulator.model, parameters.device
     head = StochasticHead.for_model(model, device).of_acceleration()
     complete = head.completed(parameters).clone()
-    for parameter, values in ((TIME, time), (SCALE, scale)):
+    for parameter, values in ((RELAXATION_TIME, time), (NOISE_SCALE, scale)):
         column = head.space.names.index(parameter.name)
         complete[:, column] = values.clamp(parameter.low, parameter.high)
     policy = FixedPolicy()

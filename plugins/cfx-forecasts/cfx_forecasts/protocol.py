@@ -13,22 +13,24 @@ import torch
 from pydantic import AfterValidator, Field
 from torch import Tensor
 
-from cfx.core.component import Settings
 from cfx.errors import ConfigError, DataError
-from cfx.evaluation.closed_loop import Followers
-from cfx.evaluation.forecasts import (
+from cfx.plugin import (
+    Agent,
+    FixedPolicy,
+    FoldsOrFinished,
+    FoldsOrFinishedSettings,
+    Followers,
+    HeldOut,
     LeaderFuture,
     Origins,
     Paths,
+    ProtocolContext,
+    ProtocolResult,
+    Settings,
+    in_text,
     measured_paths,
     sample_from_origins,
 )
-from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
-from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
-from cfx.evaluation.protocols.held_out import HeldOut
-from cfx.evaluation.tables import in_text
-from cfx.policies.agent import Agent
-from cfx.policies.constant import FixedPolicy
 from cfx_forecasts.distributions import Recorded, score_distributions
 from cfx_forecasts.errors import forecast_errors, forecast_values, kinematic_paths
 from cfx_forecasts.noise import can_drive, constant_with_noise, residual_noise

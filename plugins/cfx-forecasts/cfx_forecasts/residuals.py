@@ -11,9 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.data.pairs import PairBatch
-from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.simulation.step import advance_vehicle
+from cfx.plugin import DrivingModel, Follower, Leader, PairBatch, advance_vehicle
 
 
 class ResidualStatistics(NamedTuple):

@@ -9,8 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.evaluation.metrics.base import key_of
-from cfx.figures.job import Job
+from cfx.plugin import Job, key_of
 from cfx_forecasts.distributions import centre_errors, sampled_methods, summarize_distributions
 from cfx_forecasts.errors import SCOPE, forecast_methods, metric_name
 from cfx_forecasts.figures import sampled_name

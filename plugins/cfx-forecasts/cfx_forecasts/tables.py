@@ -6,8 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from rich.table import Table
 
-from cfx import Column, Findings, ResultTable
-from cfx.results.table import metrics_table
+from cfx.plugin import Column, Findings, ResultTable, metrics_table
 from cfx_forecasts.distributions import LEVEL, centre_errors, distribution_metrics, sampled_methods
 from cfx_forecasts.errors import SCOPE, forecast_methods, forecast_metrics, metric_name
 

@@ -16,9 +16,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from cfx.calibration.losses import SegmentLosses
-from cfx.core.parameters import ParameterSpace, squashed
-from cfx.simulation.trajectory import ComponentKey, Terms
+from cfx.plugin import ComponentKey, ParameterSpace, SegmentLosses, Terms, squashed
 from cfx_posteriors import noise
 
 DEVIATION = 1.5

@@ -29,7 +29,7 @@ import torch
 from arviz_stats.base.array import array_stats
 from torch import Tensor
 
-from cfx.calibration.settings import RELIABLE
+from cfx.plugin import MAX_PARETO_K
 from cfx_posteriors.density import Posterior
 from cfx_posteriors.laplace import Normal, curvature
 from cfx_posteriors.tempered import tempered
@@ -85,7 +85,7 @@ class Sampled(NamedTuple):
     @property
     def reliable(self) -> Tensor:
         """Whether the samples stand in for the posterior, bool `(P,)`."""
-        return self.pareto_k <= RELIABLE
+        return self.pareto_k <= MAX_PARETO_K
 
     @property
     def chains(self) -> int:

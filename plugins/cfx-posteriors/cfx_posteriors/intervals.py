@@ -16,15 +16,20 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx.calibration.losses import SegmentLosses
-from cfx.calibration.posterior import DriverPosteriors, PosteriorMethod
-from cfx.calibration.settings import LEVEL, CalibrationSettings
-from cfx.calibration.shards import Solver
-from cfx.core.distributions import install_line
-from cfx.core.parameters import ParameterSpace, squashed
-from cfx.data.pairs import PairBatch
 from cfx.errors import NotInstalledError
-from cfx.simulation.trajectory import Segments
+from cfx.plugin import (
+    INTERVAL_LEVEL,
+    CalibrationSettings,
+    DriverPosteriors,
+    PairBatch,
+    ParameterSpace,
+    PosteriorMethod,
+    SegmentLosses,
+    Segments,
+    Solver,
+    install_line,
+    squashed,
+)
 from cfx_posteriors.density import ParameterPrior, Posterior
 from cfx_posteriors.fan import Fan, fan_of
 from cfx_posteriors.importance import DRAWS, Sampled, sample
@@ -35,7 +40,7 @@ if TYPE_CHECKING:
     from cfx_posteriors.neural import Learned
     from cfx_posteriors.nuts import Chains
 
-_SHARES = (0.5 - 0.5 * LEVEL, 0.5, 0.5 + 0.5 * LEVEL)
+_SHARES = (0.5 - 0.5 * INTERVAL_LEVEL, 0.5, 0.5 + 0.5 * INTERVAL_LEVEL)
 
 NEW_DRIVERS = 1000
 """Drivers that are drawn from a prior or a population and kept."""

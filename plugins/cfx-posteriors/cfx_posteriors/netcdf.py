@@ -16,14 +16,16 @@ import pandas as pd
 import xarray as xr
 from numpy.typing import NDArray
 
-from cfx import DrivingModel
-from cfx.core.command import ExportFormat
-from cfx.core.files import write_output
-from cfx.core.job_folder import read_yaml
-from cfx.core.registry import create
 from cfx.errors import DataError
-from cfx.results.table import read_tables
-from cfx.results.tracker import folder_of
+from cfx.plugin import (
+    DrivingModel,
+    ExportFormat,
+    create,
+    folder_of,
+    read_tables,
+    read_yaml,
+    write_output,
+)
 
 NAME = "posterior.nc"
 

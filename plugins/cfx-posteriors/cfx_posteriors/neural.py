@@ -35,7 +35,7 @@ from sbi.inference import NPE
 from sbi.neural_nets import posterior_nn
 from torch import Tensor, nn
 
-from cfx.calibration.settings import LEVEL, RELIABLE
+from cfx.plugin import INTERVAL_LEVEL, MAX_PARETO_K
 from cfx_posteriors import noise
 from cfx_posteriors.density import Posterior
 from cfx_posteriors.importance import (
@@ -278,7 +278,7 @@ class _Round:
                 *self.aside, self.posterior, num_posterior_samples=200, show_progress_bar=False
             )
         away = (ranks / 200.0 - 0.5).abs()
-        return float((away < 0.5 * LEVEL).double().mean())
+        return float((away < 0.5 * INTERVAL_LEVEL).double().mean())
 
 
 def learn(posterior: Posterior, shares: Tensor, *, seed: int, memory: int) -> Learned:
@@ -326,7 +326,7 @@ def _learned(posterior: Posterior, shares: Tensor, seed: int, memory: int) -> Le
     prior = posterior.prior.log_density(own[..., :n]) + noise.prior_log_density(own[..., n:])
     inner = rounds[-1].region.inner(own)
     of_flow = (prior + 0.5 * inner.square().sum(-1)).softmax(dim=1)
-    trusted = (k <= RELIABLE)[:, None, None]
+    trusted = (k <= MAX_PARETO_K)[:, None, None]
     weighted = weighted_quantiles(places[..., :n], smooth.exp(), shares)
     alone = weighted_quantiles(own[..., :n], of_flow, shares)
     draws = systematic(places, smooth.exp(), DRAWS, generator)

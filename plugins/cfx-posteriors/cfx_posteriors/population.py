@@ -22,7 +22,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from cfx.core.parameters import ParameterSpace
+from cfx.plugin import ParameterSpace
 from cfx_posteriors.density import ParameterPrior, Posterior, normal_draws
 from cfx_posteriors.laplace import Normal, laplace
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from cfx import Column, ResultTable
+from cfx.plugin import Column, ResultTable
 
 PAIR = Column("pair_id", "", "the pair of leader and follower", "text")
 

@@ -26,9 +26,8 @@ from urllib.parse import urlsplit
 
 from filelock import FileLock, Timeout
 
-from cfx.core.files import atomic_write
-from cfx.core.progress import Task
 from cfx.errors import ConfigError, DataError, OutputError
+from cfx.plugin import Task, atomic_write
 from cfx_recordings.ngsim import MOTORWAY
 
 if TYPE_CHECKING:

@@ -6,7 +6,7 @@ import argparse
 import shlex
 from pathlib import Path
 
-from cfx import Command
+from cfx.plugin import Command
 
 
 class FetchCommand(Command):
@@ -37,8 +37,7 @@ class FetchCommand(Command):
         return parser
 
     def run(self, options: argparse.Namespace) -> int:
-        from cfx.core.console import console_logging
-        from cfx.core.files import path_override
+        from cfx.plugin import console_logging, path_override
         from cfx_recordings.fetch import URL, fetch_ngsim_i80
 
         with console_logging(), console_logging("cfx_recordings"):

@@ -15,10 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cfx import PairSet, Settings
-from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, magic, stem
 from cfx.errors import DataError
+from cfx.plugin import (
+    Contents,
+    Dataset,
+    FileDatasetSettings,
+    FileStart,
+    Floats,
+    PairSet,
+    Settings,
+    first_bytes,
+    joined,
+    stem,
+)
 from cfx_recordings.series import Series, pairs_of
 
 _NPY, _ZIP, _MATLAB, _HDF = b"\x93NUM", b"PK\x03\x04", b"MATL", b"\x89HDF"
@@ -135,7 +144,7 @@ def _events(path: Path) -> Iterator[Floats]:
 
 def _arrays(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
     """Yields the arrays of a file by their names; runs no code that may be in it."""
-    start = magic(path)
+    start = first_bytes(path)
     try:
         if start == _NPY:
             yield path.name, np.load(path, allow_pickle=False)

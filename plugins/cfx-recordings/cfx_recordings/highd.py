@@ -11,13 +11,24 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from cfx import PairSet, Settings
-from cfx.data.base import Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints
-from cfx.data.sites import with_sites
-from cfx.data.table import FileColumn, Layout, Table, read_table
-from cfx.data.tracks import Tracks, extract_pairs
 from cfx.errors import DataError
+from cfx.plugin import (
+    Dataset,
+    FileColumn,
+    FileDatasetSettings,
+    FileStart,
+    Floats,
+    Ints,
+    Layout,
+    PairSet,
+    Settings,
+    Table,
+    Tracks,
+    extract_pairs,
+    joined,
+    read_table,
+    with_sites,
+)
 
 _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
 

@@ -15,10 +15,19 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from cfx import PairSet, Settings
-from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints, stem
 from cfx.errors import DataError
+from cfx.plugin import (
+    Contents,
+    Dataset,
+    FileDatasetSettings,
+    FileStart,
+    Floats,
+    Ints,
+    PairSet,
+    Settings,
+    joined,
+    stem,
+)
 from cfx_recordings.series import Series, frames_at, pairs_of
 
 DT = 0.1

@@ -19,13 +19,28 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from cfx.core.component import Settings
-from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints, stem
-from cfx.data.pairs import Dropped, PairSet
-from cfx.data.table import FileColumn, Layout, NameColumn, Table, read_table
-from cfx.data.tracks import Tracks, changes, extract_pairs
 from cfx.errors import DataError, listed, nearest
+from cfx.plugin import (
+    Contents,
+    Dataset,
+    Dropped,
+    FileColumn,
+    FileDatasetSettings,
+    FileStart,
+    Floats,
+    Ints,
+    Layout,
+    NameColumn,
+    PairSet,
+    Settings,
+    Table,
+    Tracks,
+    changes,
+    extract_pairs,
+    joined,
+    read_table,
+    stem,
+)
 
 FOOT = 0.3048
 """Metres; exact by definition."""

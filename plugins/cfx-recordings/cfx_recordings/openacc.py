@@ -13,11 +13,25 @@ from typing import ClassVar, NamedTuple, TypeVar
 
 import numpy as np
 
-from cfx import PairSet, Settings
-from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints, beginning, stem
-from cfx.data.table import FileColumn, Layout, NameColumn, Table, read_table
 from cfx.errors import DataError, listed
+from cfx.plugin import (
+    Contents,
+    Dataset,
+    FileColumn,
+    FileDatasetSettings,
+    FileStart,
+    Floats,
+    Ints,
+    Layout,
+    NameColumn,
+    PairSet,
+    Settings,
+    Table,
+    beginning,
+    joined,
+    read_table,
+    stem,
+)
 from cfx_recordings.series import Series, frames_at, pairs_of
 
 _Column = TypeVar("_Column", Floats, NameColumn)

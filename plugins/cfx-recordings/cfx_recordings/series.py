@@ -8,11 +8,15 @@ from typing import Any
 
 import numpy as np
 
-from cfx.data.files import Floats, Ints
-from cfx.data.pairs import Dropped, Pair, PairSet
-from cfx.data.tracks import (
+from cfx.errors import DataError
+from cfx.plugin import (
     SINGLE_FRAME,
+    Dropped,
+    Floats,
+    Ints,
     Marks,
+    Pair,
+    PairSet,
     accelerations,
     counted,
     driven,
@@ -21,7 +25,6 @@ from cfx.data.tracks import (
     summed,
     unique_name,
 )
-from cfx.errors import DataError
 
 _STEP_ROOM = 0.05
 """How far the typical step between times may be from the layout's, as a share of it."""

@@ -13,12 +13,24 @@ from typing import ClassVar
 
 import numpy as np
 
-from cfx import PairSet, Settings
-from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints, stem
-from cfx.data.table import FileColumn, Layout, Table, read_table
-from cfx.data.tracks import changes
 from cfx.errors import DataError
+from cfx.plugin import (
+    Contents,
+    Dataset,
+    FileColumn,
+    FileDatasetSettings,
+    FileStart,
+    Floats,
+    Ints,
+    Layout,
+    PairSet,
+    Settings,
+    Table,
+    changes,
+    joined,
+    read_table,
+    stem,
+)
 from cfx_recordings.series import Series, frames_at, pairs_of
 
 DT = 0.1

@@ -21,14 +21,14 @@ SIGNALS = [
 ]
 
 
-def made_pairs(pairs: int = 3, frames: int = 150) -> cfx.PairSet:
+def made_pairs(pairs: int = 3, frames: int = 150) -> cfx.plugin.PairSet:
     """Pairs whose speeds and positions belong together."""
     made = cfx.get("dataset", "synthetic")(pairs=pairs, frames=frames, min_duration=0)
-    assert isinstance(made, cfx.Dataset)
+    assert isinstance(made, cfx.plugin.Dataset)
     return made.load()
 
 
-def write_highd(folder: Path, pairs: cfx.PairSet, number: str = "01") -> Path:
+def write_highd(folder: Path, pairs: cfx.plugin.PairSet, number: str = "01") -> Path:
     """highD's three files; every second pair drives to the left, as its upper lanes do."""
     rows, meta = [], []
     for index, pair in enumerate(pairs):

@@ -24,10 +24,10 @@ from cfx_recordings.openacc import OpenaccDataset
 from cfx_recordings.waymo_pairs import WaymoPairsDataset
 
 
-def made_pairs(pairs: int = 3, frames: int = 150) -> cfx.PairSet:
+def made_pairs(pairs: int = 3, frames: int = 150) -> cfx.plugin.PairSet:
     """Pairs whose speeds and positions belong together."""
     made = cfx.get("dataset", "synthetic")(pairs=pairs, frames=frames, min_duration=0)
-    assert isinstance(made, cfx.Dataset)
+    assert isinstance(made, cfx.plugin.Dataset)
     return made.load()
 
 
@@ -41,7 +41,11 @@ OPENACC_ABOUT = (
 
 
 def write_openacc(
-    path: Path, pairs: cfx.PairSet, *, acc: str = "2", drivers: dict[int, list[str]] | None = None
+    path: Path,
+    pairs: cfx.plugin.PairSet,
+    *,
+    acc: str = "2",
+    drivers: dict[int, list[str]] | None = None,
 ) -> Path:
     """One of OpenACC's files: pair k is vehicles k and k + 1 of a platoon."""
     frames = min(len(pair) for pair in pairs)
@@ -58,7 +62,7 @@ def write_openacc(
     return path
 
 
-def write_waymo(path: Path, pairs: cfx.PairSet, *, first_version: bool = False) -> Path:
+def write_waymo(path: Path, pairs: cfx.plugin.PairSet, *, first_version: bool = False) -> Path:
     """The Waymo pairs' CSV: rows of both vehicles; vehicle 0 is the automated one."""
     rows = []
     for segment, pair in enumerate(pairs):
@@ -82,7 +86,7 @@ def write_waymo(path: Path, pairs: cfx.PairSet, *, first_version: bool = False) 
     return path
 
 
-def events_of(pairs: cfx.PairSet) -> np.ndarray:
+def events_of(pairs: cfx.plugin.PairSet) -> np.ndarray:
     """FollowNet's array `(events, 4, samples)`, padded by NaN."""
     longest = max(len(pair) for pair in pairs)
     events = np.full((len(pairs), 4, longest), np.nan)
@@ -92,7 +96,7 @@ def events_of(pairs: cfx.PairSet) -> np.ndarray:
     return events
 
 
-def write_lyft(folder: Path, pairs: cfx.PairSet, *, with_size: bool = True) -> Path:
+def write_lyft(folder: Path, pairs: cfx.plugin.PairSet, *, with_size: bool = True) -> Path:
     """A Zarr store of Lyft's pairs, in version 2 of the format, as they are published."""
     import zarr
 
@@ -122,25 +126,25 @@ def write_lyft(folder: Path, pairs: cfx.PairSet, *, with_size: bool = True) -> P
     return folder
 
 
-def npy(folder: Path, pairs: cfx.PairSet) -> Path:
+def npy(folder: Path, pairs: cfx.plugin.PairSet) -> Path:
     path = folder / "HighD_train_data.npy"
     np.save(path, events_of(pairs))
     return path
 
 
-def openacc(folder: Path, pairs: cfx.PairSet) -> Path:
+def openacc(folder: Path, pairs: cfx.plugin.PairSet) -> Path:
     return write_openacc(folder / "ASta_040719_platoon3.csv", pairs)
 
 
-def waymo(folder: Path, pairs: cfx.PairSet) -> Path:
+def waymo(folder: Path, pairs: cfx.plugin.PairSet) -> Path:
     return write_waymo(folder / "all_seg_paired_cf_trj_final.csv", pairs)
 
 
-def lyft(folder: Path, pairs: cfx.PairSet) -> Path:
+def lyft(folder: Path, pairs: cfx.plugin.PairSet) -> Path:
     return write_lyft(folder / "trainHH.zarr", pairs)
 
 
-READERS: dict[str, tuple[type[cfx.Dataset], Callable[[Path, cfx.PairSet], Path]]] = {
+READERS: dict[str, tuple[type[cfx.plugin.Dataset], Callable[[Path, cfx.plugin.PairSet], Path]]] = {
     "openacc": (OpenaccDataset, openacc),
     "followernet": (FollowernetDataset, npy),
     "waymo_pairs": (WaymoPairsDataset, waymo),

@@ -6,8 +6,8 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from cfx.core.command import Command
 from cfx.errors import ConfigError
+from cfx.plugin import Command
 
 NAME = "report.html"
 
@@ -77,7 +77,7 @@ def report(
         DataError, TrackingError: the jobs cannot be read.
         OutputError: the page cannot be written.
     """
-    from cfx.figures.text import plural
+    from cfx.plugin import plural
     from cfx_report.page import write_report
     from cfx_report.paper import FORMS, write_table
     from cfx_report.runs import read_runs

@@ -18,8 +18,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cfx.figures.canvas import WIDTH, figure_style, hover_text
-from cfx.figures.figure import METADATA
+from cfx.plugin import FIGURE_METADATA, WIDTH, figure_style, hover_text
 
 _MANY_POINTS = 400
 """A cloud of more points is a picture inside a page's SVG: each point would be an element."""
@@ -43,7 +42,7 @@ def inline_svg(figure: Figure) -> str:
     with figure_style(), mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.3}):
         # `savefig` would draw twice, once for the layout alone.
         paper = FigureCanvasSVG(figure)
-        paper.print_svg(stream, metadata=METADATA["svg"])  # type: ignore[no-untyped-call]
+        paper.print_svg(stream, metadata=FIGURE_METADATA["svg"])  # type: ignore[no-untyped-call]
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     for pattern in (

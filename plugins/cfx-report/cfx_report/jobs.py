@@ -5,10 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from cfx.evaluation.metrics.base import MetricInfo
-from cfx.evaluation.result import Purpose
-from cfx.figures.job import Job
-from cfx.figures.text import TEST, pretty_unit
+from cfx.plugin import TEST, Job, MetricInfo, Purpose, pretty_unit
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,7 @@ from typing import Any
 import numpy as np
 
 from cfx.errors import ConfigError
-from cfx.evaluation.result import Purpose
-from cfx.figures.job import Job
-from cfx.figures.text import common_prefix
-from cfx.results.provenance import flatten
+from cfx.plugin import Job, Purpose, common_prefix, flatten
 from cfx_report.jobs import any_baselines
 
 GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")

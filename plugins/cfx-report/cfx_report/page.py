@@ -12,22 +12,24 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cfx.core.files import write_output
-from cfx.core.registry import installed
-from cfx.data.style import CLUSTERS
-from cfx.evaluation.headline import Comparison, contradiction
-from cfx.evaluation.result import Purpose
-from cfx.figures.figure import draw, figure_named
-from cfx.figures.job import Job
-from cfx.figures.text import (
+from cfx.plugin import (
     CLUSTER_COLOURS,
+    CLUSTERS,
     COLOURS,
     TEST,
+    Comparison,
+    Job,
+    Purpose,
+    contradiction,
+    draw_figure,
     explained,
     few_drivers,
+    figure_named,
+    installed,
     percent,
     plural,
     short_label,
+    write_output,
 )
 from cfx_report.inline import inline_scripts, security_policy
 from cfx_report.jobs import Runs, of_purpose
@@ -110,7 +112,7 @@ def _environment(runs: Runs) -> Environment:
 def _drawn(environment: Environment, name: str, job: Job) -> Any:
     """Returns the figure of a name as the job has written it; "" if the job lacks its data."""
     found = figure_named(name)
-    drawing = draw(found, job.results)
+    drawing = draw_figure(found, job.results)
     if drawing is None:
         return ""
     figure: Any = environment.globals["figure"]

@@ -10,12 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cfx.calibration.identifiability import NEAR
-from cfx.core.files import write_output
-from cfx.core.job_folder import without_folders
-from cfx.evaluation.result import Purpose
-from cfx.figures.job import Job
-from cfx.figures.text import short_label
+from cfx.plugin import NEARLY_BEST, Job, Purpose, short_label, without_folders, write_output
 from cfx_report.jobs import Runs
 from cfx_report.names import Row, any_adapts, baselines_of, methods_of, rows_of
 from cfx_report.sections.calibration import sheet, slices_of, spreads_of
@@ -149,8 +144,8 @@ def _parameter_tables(rows: Sequence[Row]) -> Iterator[str]:
         caption = (
             f"Calibrated parameters, {name}: the model's default, the mean of the folds' pooled"
             " parameters, and median and quantiles of the driver-specific ones. Flat: the loss is"
-            f" within {100 * NEAR:.0f} \\% of a driver's best, on so much of the range (median over"
-            " pairs), and for so many pairs on all of it."
+            f" within {100 * NEARLY_BEST:.0f} \\% of a driver's best, on so much of the range"
+            " (median over pairs), and for so many pairs on all of it."
         )
         label = re.sub(r"\W+", "-", row.name).strip("-")
         yield _latex_table(table, caption, f"tab:cfx-parameters-{label}")

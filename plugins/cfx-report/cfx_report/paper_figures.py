@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from cfx.core.command import Command
 from cfx.errors import ConfigError
+from cfx.plugin import Command
 
 if TYPE_CHECKING:
-    from cfx.figures.job import Job
+    from cfx.plugin import Job
 
 _FORMATS = ("pdf", "svg", "png")
 _WIDTHS_MM = (30.0, 1000.0)
@@ -101,10 +101,7 @@ def draw(
         DataError, TrackingError: the jobs cannot be read.
         OutputError: a file cannot be written.
     """
-    from cfx.core.registry import installed
-    from cfx.figures.canvas import Paper, on_paper
-    from cfx.figures.figure import write_figures
-    from cfx.figures.text import plural
+    from cfx.plugin import Paper, installed, on_paper, plural, write_figures
     from cfx_report.runs import read_runs
 
     known = sorted(one.name for one in installed("figure"))
@@ -127,8 +124,7 @@ def draw(
 
 def _compared(jobs: Sequence[Job], folder: Path, formats: Sequence[str]) -> list[str]:
     """Draws jobs against the one that is closest to the drivers; returns what to tell the user."""
-    from cfx.evaluation.statistics import against_the_best, verdict
-    from cfx.figures.figure import write_figure
+    from cfx.plugin import against_the_best, verdict, write_figure
     from cfx_report.figures.models import draw_models
 
     errors = {job.name: job.errors for job in jobs}
@@ -146,7 +142,7 @@ def _width_mm(text: str) -> float:
     Raises:
         ConfigError: it is no length, or one that no figure has.
     """
-    from cfx.data.units import length_mm
+    from cfx.plugin import length_mm
 
     least, most = _WIDTHS_MM
     try:

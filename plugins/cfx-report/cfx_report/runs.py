@@ -10,11 +10,17 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from cfx.core.job_folder import optional, read_json
-from cfx.core.storage import is_url, local_folder
 from cfx.errors import DataError, without_passwords
-from cfx.figures.job import Job, read_job
-from cfx.results.tracker import Origin, tracking_of_run
+from cfx.plugin import (
+    Job,
+    Origin,
+    is_url,
+    local_folder,
+    optional,
+    read_job,
+    read_json,
+    tracking_of_run,
+)
 from cfx_report.jobs import Runs, Unfinished
 from cfx_report.names import named
 

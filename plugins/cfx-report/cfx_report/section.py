@@ -12,10 +12,17 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
-from cfx.core.component import Component
-from cfx.core.registry import Kind, add_kind
-from cfx.figures.job import Job
-from cfx.figures.text import MINUS, NOTHING, explained, percent, short_label
+from cfx.plugin import (
+    MINUS,
+    NOTHING,
+    Component,
+    Job,
+    Kind,
+    add_kind,
+    explained,
+    percent,
+    short_label,
+)
 from cfx_report.jobs import Runs
 
 if TYPE_CHECKING:

@@ -7,7 +7,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from cfx import Command
+from cfx.plugin import Command
 
 
 class DriveCommand(Command):
@@ -104,7 +104,7 @@ def _drive(options: argparse.Namespace) -> None:
     # without.
     # None is Python's own way to say that a module is not there.
     sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
-    from cfx.core.console import console_logging
+    from cfx.plugin import console_logging
     from cfx_sumo.drive.run import parse_drivers, report, run_scenario
     from cfx_sumo.drive.scenarios import SCENARIOS
 

@@ -14,16 +14,21 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel
-from cfx.calibration.identifiability import COLUMN
-from cfx.core.command import ExportFormat
-from cfx.core.files import write_output
-from cfx.core.job_folder import examine, parse_json, parse_yaml
-from cfx.core.registry import create
-from cfx.data.signals import COARSE_S
 from cfx.errors import ConfigError, DataError, listed
-from cfx.models.vtype import InSumo, VType
-from cfx.results.tracker import folder_of
+from cfx.plugin import (
+    COARSE_S,
+    FLAT_SHARE_PREFIX,
+    DrivingModel,
+    ExportFormat,
+    InSumo,
+    VType,
+    create,
+    examine,
+    folder_of,
+    parse_json,
+    parse_yaml,
+    write_output,
+)
 from cfx_sumo.limits import lost_limits
 
 NAME = "drivers.add.xml"
@@ -233,8 +238,8 @@ def _undetermined(table: pd.DataFrame) -> list[str]:
 
 def _flat(table: pd.DataFrame, row: Any) -> list[str]:
     """Returns the parameters whose loss is flat for the driver of a row, by cfx's names."""
-    columns = [str(name) for name in table if str(name).startswith(COLUMN)]
-    return [name.removeprefix(COLUMN) for name in columns if table[name][row] == 1]
+    columns = [str(name) for name in table if str(name).startswith(FLAT_SHARE_PREFIX)]
+    return [name.removeprefix(FLAT_SHARE_PREFIX) for name in columns if table[name][row] == 1]
 
 
 def _xml(lines: list[str], notes: list[str]) -> str:

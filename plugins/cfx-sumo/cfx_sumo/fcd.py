@@ -12,11 +12,23 @@ from typing import Annotated, ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from cfx import Dataset, PairSet, Settings
-from cfx.data.base import FileDatasetSettings, joined
-from cfx.data.files import FileStart, Floats, Ints, stem
-from cfx.data.tracks import NOBODY, Marks, Tracks, counted, extract_pairs
 from cfx.errors import DataError, listed
+from cfx.plugin import (
+    NOBODY,
+    Dataset,
+    FileDatasetSettings,
+    FileStart,
+    Floats,
+    Ints,
+    Marks,
+    PairSet,
+    Settings,
+    Tracks,
+    counted,
+    extract_pairs,
+    joined,
+    stem,
+)
 from cfx_sumo.fcd_lanes import Couples, Lanes
 from cfx_sumo.fcd_rows import FcdRows, is_fcd, read_rows
 

@@ -11,8 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.data.files import Floats, Ints
-from cfx.data.tracks import NOBODY, Marks, changes
+from cfx.plugin import NOBODY, Floats, Ints, Marks, changes
 
 _STANDING_MPS = 0.1
 """m/s: a vehicle below this stands."""

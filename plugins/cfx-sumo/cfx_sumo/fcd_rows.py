@@ -15,11 +15,19 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.data.files import FileStart, Floats, Ints, open_text
-from cfx.data.pairs import Dropped
-from cfx.data.table import FileColumn, Layout, Table, read_table
-from cfx.data.tracks import counted
 from cfx.errors import DataError
+from cfx.plugin import (
+    Dropped,
+    FileColumn,
+    FileStart,
+    Floats,
+    Ints,
+    Layout,
+    Table,
+    counted,
+    open_text,
+    read_table,
+)
 
 _BLOCK = 1 << 20
 

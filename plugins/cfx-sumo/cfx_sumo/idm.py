@@ -10,9 +10,16 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx.core.parameters import Parameter, ParameterSpace
-from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
-from cfx.models.vtype import VType, sumo_speed
+from cfx.plugin import (
+    DrivingModel,
+    Follower,
+    Leader,
+    Parameter,
+    ParameterSpace,
+    VType,
+    bumper_gap,
+    sumo_speed,
+)
 
 _SUMO = "default: SUMO's passenger car"
 _BOUNDS = f"{_SUMO}; bounds: about those of Kesting and Treiber (2008), Transp. Res. Rec. 2088"

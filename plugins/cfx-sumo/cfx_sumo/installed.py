@@ -8,8 +8,8 @@ from __future__ import annotations
 import importlib.metadata
 import re
 
-from cfx.core.distributions import install_line
 from cfx.errors import NotInstalledError, SumoError
+from cfx.plugin import install_line
 
 DISTRIBUTION = "cfx-sumo"
 """What brings SUMO."""

@@ -10,10 +10,18 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx.core.parameters import Parameter, ParameterSpace
-from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
-from cfx.models.regimes import safe_divisor, safe_sqrt
-from cfx.models.vtype import VType, sumo_speed
+from cfx.plugin import (
+    DrivingModel,
+    Follower,
+    Leader,
+    Parameter,
+    ParameterSpace,
+    VType,
+    bumper_gap,
+    safe_divisor,
+    safe_sqrt,
+    sumo_speed,
+)
 
 _SUMO = "default: SUMO's passenger car"
 _BOUNDS = f"{_SUMO}; bounds: wide enough for drivers who stay far behind"

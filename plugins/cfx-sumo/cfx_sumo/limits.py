@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from cfx import DrivingModel
-from cfx.models.limits import LimitSettings
-from cfx.models.vtype import VType
+from cfx.plugin import DrivingModel, LimitSettings, VType
 
 
 def lost_limits(model: DrivingModel, kind: VType) -> list[str]:

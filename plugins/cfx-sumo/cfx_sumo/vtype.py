@@ -9,10 +9,17 @@ from typing import ClassVar, NoReturn
 from pydantic import Field
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, ModelSettings, ParameterSpace, Settings
-from cfx.core.parameters import ParameterOverride
 from cfx.errors import ConfigError
-from cfx.models.vtype import VType
+from cfx.plugin import (
+    DrivingModel,
+    Follower,
+    Leader,
+    ModelSettings,
+    ParameterOverride,
+    ParameterSpace,
+    Settings,
+    VType,
+)
 
 _UNITS = {
     "tau": "s",

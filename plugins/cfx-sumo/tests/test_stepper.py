@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 
 import cfx
-from cfx import DrivingModel, Follower, Leader, Start
 from cfx.errors import ConfigError, SumoError
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
+from cfx.plugin import DrivingModel, Follower, Leader, Start
 from cfx.simulation.rollout import MemoryStepper
 from cfx_community.models.w74 import W74
 from cfx_contracts import check_contract

@@ -18,7 +18,7 @@ OWN = [one.name for one in registry.entries("command") if one.distribution == OW
 
 CENSUS = """
     import argparse
-    from cfx import Command
+    from cfx.plugin import Command
     {loaded}
 
     class Census(Command):

@@ -11,7 +11,6 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cfx import FrameValues, Objective
 from cfx.calibration.huber import SpeedHuber
 from cfx.calibration.mixed import Mixed
 from cfx.calibration.rmse import GapRmse, SpeedRmse
@@ -19,6 +18,7 @@ from cfx.calibration.theil_u import TheilU
 from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.errors import ConfigError
+from cfx.plugin import FrameValues, Objective
 from cfx_contracts import check_contract
 
 SHIPPED = {

@@ -22,7 +22,7 @@ from tests.broken_plugins import QUICK
 from tests.installer import Installer
 
 GOOD = """
-from cfx import Metric
+from cfx.plugin import Metric
 
 class Good(Metric):
     unit = "m"
@@ -133,7 +133,7 @@ BROKEN = {
     "of_frames": broken("return gap"),
     "settled": GOOD.replace(
         "class Good(Metric):",
-        "from cfx import Settings\nclass Own(Settings):\n    x: int = 1\n"
+        "from cfx.plugin import Settings\nclass Own(Settings):\n    x: int = 1\n"
         "class Good(Metric):\n    schema = Own",
     ),
     "improvement": GOOD,

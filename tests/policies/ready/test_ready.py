@@ -63,7 +63,7 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
         assert event["collisions"] == 0
         assert event["hardest_braking"] <= 9.0 + 1e-6
         assert event["hardest_acceleration"] <= 2.6 + 1e-6
-    text = (ready.FOLDER / name / "CARD.md").read_text(encoding="utf-8")
+    text = (ready.READY_FOLDER / name / "CARD.md").read_text(encoding="utf-8")
     assert card["command"] in text
     for row in card.get("sites", ()):
         assert row["site"] in text
@@ -96,7 +96,7 @@ def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated(name: str, lea
     for row in rows:
         # Of drivers of roads that it does not know fewer are within the central 90 %.
         assert least <= row["coverage"] <= 0.95
-    text = (ready.FOLDER / name / "CARD.md").read_text(encoding="utf-8")
+    text = (ready.READY_FOLDER / name / "CARD.md").read_text(encoding="utf-8")
     assert "Sampled forecasts" in text
     assert "residual_scale" not in text
 
@@ -165,7 +165,7 @@ def test_a_policy_that_answers_what_its_model_does_not_use_is_tested_all_the_sam
 def test_a_policy_that_is_too_large_or_no_object_is_not_read(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    agent = checkpoint.load_agent(ready.FOLDER / NAMES[0] / "policy")
+    agent = checkpoint.load_agent(ready.READY_FOLDER / NAMES[0] / "policy")
     checkpoint.save_agent(agent, tmp_path)
     monkeypatch.setattr("cfx.core.job_folder._LARGEST_MB", 0.2)
     with pytest.raises(DataError, match=r"policy\.safetensors has 0 MB, at most 0\.2"):

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from cfx.data.style import StyleResult
 from cfx.evaluation.tables import scope_label
 from cfx.figures.figure import ParameterAxis
-from cfx.figures.text import common_prefix, short
+from cfx.figures.text import common_prefix, shortened
 from cfx_report.figures.calibration import correlations, parameter_spreads, spread_offsets
 from cfx_report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
 from cfx_report.figures.jobs import error_limit
@@ -85,7 +85,7 @@ def test_names() -> None:
     assert common_prefix(["one"]) == ""
     assert sorted(["a/11", "a/9"], key=natural_order) == ["a/9", "a/11"]
     assert scope_label("steady", 4.0) == "test part after the first 4 s"
-    assert short("abcdefghij", 7) == "abc…hij"
+    assert shortened("abcdefghij", 7) == "abc…hij"
 
 
 def calibrated(values: list[float]) -> pd.DataFrame:

@@ -16,8 +16,8 @@ from matplotlib.image import imread
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation, Purpose
-from cfx.figures.figure import Results, draw, figure_named, write_figure, write_figures
-from cfx.figures.text import COLOURS, percent, pretty_unit, short, unit_label
+from cfx.figures.figure import Results, draw_figure, figure_named, write_figure, write_figures
+from cfx.figures.text import COLOURS, percent, pretty_unit, shortened, unit_label
 from cfx.learners.curves import over_networks
 from cfx_forecasts.figures import errors_over_time
 from cfx_report.figures.improvements import amounts_of
@@ -41,7 +41,7 @@ def all_of(made: MadeUp) -> Results:
 
 
 def drawn(name: str, results: Results) -> Figure:
-    found = draw(figure_named(name), results)
+    found = draw_figure(figure_named(name), results)
     assert found is not None
     return found
 
@@ -93,7 +93,7 @@ def test_every_size_of_job_is_drawn(tmp_path: Path, options: dict[str, Any], fil
 
 def test_errors_over_time_are_those_of_the_pairs_that_still_drive() -> None:
     drives = make_results(pairs=4, frames=30).evaluation.trajectories
-    short = [
+    shortened = [
         dataclasses.replace(
             d,
             time=d.time[:11],
@@ -108,7 +108,7 @@ def test_errors_over_time_are_those_of_the_pairs_that_still_drive() -> None:
     assert seconds[0] == 0
     assert error[0] == 0
     seconds, _ = errors_over_time(
-        [short[0], *drives[1:]], "policy", "speed"
+        [shortened[0], *drives[1:]], "policy", "speed"
     )  # three of four are not nearly all
     assert len(seconds) == 11
     assert "time since the test part began" in texts(
@@ -280,7 +280,7 @@ def test_labels() -> None:
     assert percent(-0.1234, 1) == "\N{MINUS SIGN}12.3 %"
     assert pretty_unit("1e-4/(m s)") == "10⁻⁴/(m s)"
     assert unit_label("k", "1") == "k"
-    assert short("abcdefghij", 7) == "abc…hij"
+    assert shortened("abcdefghij", 7) == "abc…hij"
 
 
 def test_each_method_has_its_own_speed_plot() -> None:
@@ -321,10 +321,10 @@ def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
     history = make_history(make_results(pairs=6, frames=20).evaluation.trajectories, GAINS)
     assert amounts_of(history) == ["0 s", "10 s", "80 %"]
     # A drive may be shorter than the longest amount in seconds.
-    short = history.assign(
+    shortened = history.assign(
         history_s=history["history_s"].where(~history["amount"].str.endswith("%"), 8.0)
     )
-    assert amounts_of(short) == ["0 s", "10 s", "80 %"]
+    assert amounts_of(shortened) == ["0 s", "10 s", "80 %"]
     made = all_of(make_results(pairs=1, frames=5))
     (axes,) = drawn("history", dataclasses.replace(made, tables={"history": history})).axes
     own, population = axes.containers
@@ -358,8 +358,8 @@ def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
         evaluation=dataclasses.replace(made.evaluation, values=values, purpose=Purpose.CALIBRATION),
     )
     still = all_of(made)
-    assert draw(figure_named("improvement_per_driver"), still) is None
-    assert draw(figure_named("calibration"), still) is not None
+    assert draw_figure(figure_named("improvement_per_driver"), still) is None
+    assert draw_figure(figure_named("calibration"), still) is not None
     # Its policy is one of the constant sets: it is no line of its own, and improves nothing.
     written = texts(drawn("drives", still))
     assert "policy" not in written

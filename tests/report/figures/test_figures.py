@@ -14,7 +14,7 @@ from matplotlib import pyplot as plt
 from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.figures.canvas import canvas, hover
-from cfx.figures.figure import JobFigure, Results, draw, write_figure, write_figures
+from cfx.figures.figure import JobFigure, Results, draw_figure, write_figure, write_figures
 from cfx_report.inline import PLACE, inline_svg
 from cfx_report.page import render
 from cfx_report.runs import read_runs
@@ -95,7 +95,7 @@ def test_every_figure_keeps_its_contract(
     one: registry.Installed[JobFigure], everything: Results
 ) -> None:
     settings = dict(mpl.rcParams)
-    drawn = draw(one, everything)
+    drawn = draw_figure(one, everything)
     assert drawn is not None
     assert one.part.title
     assert one.part.caption.endswith(".")
@@ -103,7 +103,7 @@ def test_every_figure_keeps_its_contract(
         named = axes.get_xlabel() or axes.get_ylabel() or axes.get_title(loc="left")
         shared = drawn.get_supxlabel() or drawn.get_supylabel()
         assert named or shared, "nothing says what a panel shows"
-    again = draw(one, everything)
+    again = draw_figure(one, everything)
     assert again is not None
     svg = inline_svg(again)
     assert svg == inline_svg(drawn)
@@ -119,7 +119,7 @@ def test_the_same_figure_gives_the_same_bytes(everything: Results, tmp_path: Pat
     for form in ("png", "pdf", "svg"):
         written = []
         for name in ("figure", "again"):
-            figure = draw(one, everything)
+            figure = draw_figure(one, everything)
             assert figure is not None
             written.append(write_figure(figure, tmp_path / f"{name}.{form}").read_bytes())
         assert written[0] == written[1], form
@@ -129,7 +129,7 @@ def test_the_same_figure_gives_the_same_bytes(everything: Results, tmp_path: Pat
 def test_a_figure_of_what_was_not_measured_is_left_out(one: registry.Installed[JobFigure]) -> None:
     table = make_results(pairs=1, frames=5).evaluation.table
     bare = Results(table[table["method"] == "default"], ("default",), ())
-    assert draw(one, bare) is None
+    assert draw_figure(one, bare) is None
 
 
 def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_shows() -> None:

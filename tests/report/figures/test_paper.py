@@ -14,7 +14,7 @@ from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.errors import ConfigError
 from cfx.figures.canvas import Paper, canvas, on_paper, points, side_by_side, wrapped
-from cfx.figures.figure import Results, draw, figure_named
+from cfx.figures.figure import Results, draw_figure, figure_named
 from tests.made_up import make_results
 from tests.report.folders import write_job
 
@@ -33,7 +33,7 @@ def test_no_text_of_any_figure_is_larger_than_the_paper_asks_for(results: Result
         if one.distribution not in {OWN, "cfx-report", "cfx-forecasts"}:
             continue  # a third party's chooses sizes of its own
         with on_paper(COLUMN):
-            figure = draw(one, results)
+            figure = draw_figure(one, results)
         if figure is None:
             continue
         drawn += 1
@@ -60,7 +60,7 @@ def test_panels_stand_below_each_other_where_text_has_no_room() -> None:
 
 
 def test_the_usual_paper_is_as_it_was(results: Results) -> None:
-    figure = draw(figure_named("error_over_time"), results)
+    figure = draw_figure(figure_named("error_over_time"), results)
     assert figure is not None
     assert tuple(figure.get_size_inches()) == (10.5, 3.9)
     assert mpl.rcParams["font.size"] == mpl.rcParamsDefault["font.size"]

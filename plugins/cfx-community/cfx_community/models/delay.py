@@ -5,10 +5,10 @@ last K frames of the perceived gap and speeds in `Follower.memory` and read them
 by linear interpolation between frames: M. Treiber, A. Kesting and D. Helbing (2006), *Delays,
 inaccuracies and anticipation in microscopic traffic models*, Physica A 360(1), 71-88, section 2.1.
 
-Shapes: `*batch` as in `cfx.DrivingModel`; K frames; m = `memory_width(K)`, the width of the memory.
-The memory holds the number of frames seen so far, then gap, speed and leader speed of each frame,
-the latest first. All zeros is the memory of a driver who has seen nothing. A driver who has seen
-fewer frames than they want to recall gets the first one they saw.
+Shapes: `*batch` as in `cfx.plugin.DrivingModel`; K frames; m = `memory_width(K)`, the width of the
+memory. The memory holds the number of frames seen so far, then gap, speed and leader speed of each
+frame, the latest first. All zeros is the memory of a driver who has seen nothing. A driver who has
+seen fewer frames than they want to recall gets the first one they saw.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx import Follower, Leader, bumper_gap
+from cfx.plugin import Follower, Leader, bumper_gap
 
 
 class Perception(NamedTuple):

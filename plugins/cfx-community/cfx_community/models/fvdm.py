@@ -12,7 +12,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, Parameter, ParameterSpace, bumper_gap
+from cfx.plugin import DrivingModel, Follower, Leader, Parameter, ParameterSpace, bumper_gap
 from cfx_community.models.optimal_velocity import OPTIMAL_VELOCITY, optimal_velocity
 
 _BOOK = (

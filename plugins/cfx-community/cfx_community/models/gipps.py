@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, Parameter, ParameterSpace
+from cfx.plugin import DrivingModel, Follower, Leader, Parameter, ParameterSpace
 from cfx_community.models.delay import Perception, perceive
 
 _PAPER = "default: the mean driver of Gipps (1981); bounds: wide around it"

@@ -15,9 +15,8 @@ from typing import ClassVar
 from pydantic import Field
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, ParameterSpace, Settings
 from cfx.errors import ConfigError
-from cfx.models.base import ModelSettings
+from cfx.plugin import DrivingModel, Follower, Leader, ModelSettings, ParameterSpace, Settings
 from cfx_community.models.delay import frames_seen, memory_width, perceive, recall, remember
 from cfx_community.models.gipps import GIPPS_PARAMETERS, intended_speed
 

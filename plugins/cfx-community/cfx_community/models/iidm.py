@@ -12,7 +12,8 @@ from typing import cast
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, bumper_gap, get
+from cfx import get
+from cfx.plugin import DrivingModel, Follower, Leader, bumper_gap
 
 IDM = cast(type[DrivingModel], get("model", "idm"))
 

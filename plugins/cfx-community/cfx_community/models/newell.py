@@ -11,7 +11,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, Parameter, ParameterSpace, bumper_gap
+from cfx.plugin import DrivingModel, Follower, Leader, Parameter, ParameterSpace, bumper_gap
 
 _SOURCE = (
     "Newell (2002); default: with a car of 4.5 m a wave of (d + 4.5 m) / tau = 5 m/s runs upstream,"

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from cfx import Parameter
+from cfx.plugin import Parameter
 
 _BOOK = (
     "default: Treiber and Kesting (2013), section 10.6, motorway;"

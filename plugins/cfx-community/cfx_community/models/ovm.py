@@ -11,7 +11,7 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, Parameter, ParameterSpace, bumper_gap
+from cfx.plugin import DrivingModel, Follower, Leader, Parameter, ParameterSpace, bumper_gap
 from cfx_community.models.optimal_velocity import OPTIMAL_VELOCITY, optimal_velocity
 
 

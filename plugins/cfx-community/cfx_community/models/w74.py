@@ -18,9 +18,19 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from cfx.core.parameters import Parameter, ParameterSpace
-from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.regimes import SPACING, SPEED, below, exact, safe_sqrt, up_to
+from cfx.plugin import (
+    SPACING_WIDTH,
+    SPEED_WIDTH,
+    DrivingModel,
+    Follower,
+    Leader,
+    Parameter,
+    ParameterSpace,
+    safe_sqrt,
+    switches_exactly,
+    where_below,
+    where_up_to,
+)
 
 _NEAREST_ROOM = 1e-3
 """m: bounds quotients, and their gradients, beside a threshold; the brake cap acts long before."""
@@ -194,15 +204,17 @@ class W74(DrivingModel):
         emergency = torch.where(s <= ax, b_min, emergency.clamp(max=0.0))
 
         most = torch.maximum(free, b_null)
-        if not exact(self.temperature):
+        if not switches_exactly(self.temperature):
             # They are mixed, so each must be something that the vehicle can do.
             approaching = approaching.maximum(b_min).minimum(most)
             emergency = emergency.maximum(b_min).minimum(most)
         # Nested, not joined by `&`, as in w99: masks of doubles are slow to join.
-        near_by = partial(below, scale=SPACING, temperature=self.temperature)
-        slower = partial(below, scale=SPEED, temperature=self.temperature)
+        near_by = partial(where_below, scale=SPACING_WIDTH, temperature=self.temperature)
+        slower = partial(where_below, scale=SPEED_WIDTH, temperature=self.temperature)
         calm = slower(opdv, closing, near_by(s, sdx, following, free), free)
         calm = slower(sdv, closing, approaching, calm)
-        acceleration = up_to(s, abx, emergency, calm, scale=SPACING, temperature=self.temperature)
+        acceleration = where_up_to(
+            s, abx, emergency, calm, scale=SPACING_WIDTH, temperature=self.temperature
+        )
         acceleration = torch.maximum(torch.minimum(acceleration, most), b_min)
         return (v + acceleration * dt).clamp(min=0.0)

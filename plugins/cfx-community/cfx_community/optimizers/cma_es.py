@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 from torch import Tensor
 
-from cfx import CandidateLosses, Optimizer, Settings
 from cfx.errors import ConfigError
+from cfx.plugin import CandidateLosses, Optimizer, Settings
 
 if TYPE_CHECKING:
     Floats = NDArray[np.float64]

@@ -22,8 +22,8 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from cfx import CandidateLosses, Optimizer, Settings
 from cfx.errors import ConfigError
+from cfx.plugin import CandidateLosses, Optimizer, Settings
 
 Floats = NDArray[np.float64]
 

@@ -17,13 +17,19 @@ from typing import NamedTuple, Self
 import torch
 from torch import Tensor
 
-from cfx.core.parameters import squashed
 from cfx.errors import ConfigError
-from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import History, Summary
-from cfx.simulation.settings import WindowSettings
-from cfx.simulation.step import advance_vehicle
+from cfx.plugin import (
+    DrivingModel,
+    Follower,
+    History,
+    Leader,
+    Policy,
+    PolicyNetwork,
+    Summary,
+    WindowSettings,
+    advance_vehicle,
+    squashed,
+)
 
 _LARGEST = 6.0
 """Squashed parameters are kept within this, 0.25 % of a range from either bound."""

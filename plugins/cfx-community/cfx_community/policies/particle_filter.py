@@ -16,8 +16,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.core.component import Settings
-from cfx.policies.features import History
+from cfx.plugin import History, Settings
 from cfx_community.policies.estimator import (
     DrivenModel,
     EstimatorNetwork,

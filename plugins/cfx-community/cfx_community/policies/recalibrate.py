@@ -13,16 +13,19 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.calibration.losses import Prior, SegmentLosses
-from cfx.calibration.objectives import Objective
-from cfx.calibration.optimizers import Optimizer
-from cfx.core.component import Settings
-from cfx.core.parameters import squashed
-from cfx.core.registry import create
-from cfx.policies.base import ResidualSettings
-from cfx.policies.features import History
-from cfx.simulation.rollout import MemoryStepper
-from cfx.simulation.trajectory import Segments
+from cfx.plugin import (
+    History,
+    MemoryStepper,
+    Objective,
+    Optimizer,
+    Prior,
+    ResidualSettings,
+    SegmentLosses,
+    Segments,
+    Settings,
+    create,
+    squashed,
+)
 from cfx_community.policies.estimator import DrivenModel, EstimatorNetwork, EstimatorPolicy
 
 _SIGNALS = len(History._fields)

@@ -17,7 +17,7 @@ import torch
 from pydantic import Field
 from torch import Tensor, nn
 
-from cfx import Policy, PolicyNetwork, PolicySettings, Settings
+from cfx.plugin import Policy, PolicyNetwork, PolicySettings, Settings
 
 _EDGE = 0.02
 """How close to a bound an untrained network may start, in unit space: at the bound itself a sigmoid

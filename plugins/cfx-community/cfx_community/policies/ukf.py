@@ -17,9 +17,7 @@ import torch
 from pydantic import Field
 from torch import Tensor
 
-from cfx.core.component import Settings
-from cfx.policies.base import ResidualSettings
-from cfx.policies.features import History
+from cfx.plugin import History, ResidualSettings, Settings
 from cfx_community.policies.estimator import (
     DrivenModel,
     EstimatorNetwork,

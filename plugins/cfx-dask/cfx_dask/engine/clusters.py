@@ -12,9 +12,8 @@ import uuid
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from cfx.core.distributions import install_line
-from cfx.core.threads import cores
 from cfx.errors import EngineError, NotInstalledError
+from cfx.plugin import cores, install_line
 from cfx_dask.engine.settings import DaskSettings
 
 _WORKERS_ELSEWHERE = 4

@@ -8,8 +8,7 @@ import importlib.util
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from cfx.core.distributions import OWN
-from cfx.core.registry import KINDS, entries
+from cfx.plugin import KINDS, OWN, entries
 
 
 @functools.cache

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic
 
-from cfx.core.engine import ResultT, ShardT, Work
+from cfx.plugin import ResultT, ShardT, Work
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,7 @@ from collections.abc import Generator, Iterable
 from contextlib import closing
 from typing import Any, ClassVar
 
-from cfx import Settings
-from cfx.core.engine import Engine, Report, ResultT, ShardT, Work
+from cfx.plugin import Engine, Report, ResultT, Settings, ShardT, Work
 from cfx_dask.engine.clusters import require_installed
 from cfx_dask.engine.connection import Connection
 from cfx_dask.engine.run import Run

@@ -10,8 +10,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any, Generic
 
-from cfx.core.engine import Report, ResultT, ShardT, Work
 from cfx.errors import EngineError
+from cfx.plugin import Report, ResultT, ShardT, Work
 from cfx_dask.engine.code import installed_code
 from cfx_dask.engine.connection import Connection
 from cfx_dask.engine.settings import DaskSettings

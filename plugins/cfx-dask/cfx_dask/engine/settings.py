@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cfx import Settings
+from cfx.plugin import Settings
 
 Cluster = Literal["local", "slurm", "pbs", "lsf", "kubernetes"]
 

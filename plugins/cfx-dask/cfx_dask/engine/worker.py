@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from cfx.core.engine import ResultT, ShardT, Unfit, Work
-from cfx.core.threads import limit_cores, own_cores
 from cfx.errors import EngineError
+from cfx.plugin import ResultT, ShardT, Unfit, Work, limit_cores, own_cores
 from cfx_dask.engine.code import differing, installed_code
 from cfx_dask.engine.counting import Counted, counted
 

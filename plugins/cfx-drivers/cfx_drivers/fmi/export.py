@@ -12,9 +12,7 @@ from pathlib import Path
 
 from pythonfmu3 import FmuBuilder
 
-from cfx.core.command import ExportFormat
-from cfx.core.files import write_output
-from cfx.results.tracker import folder_of
+from cfx.plugin import ExportFormat, folder_of, write_output
 from cfx_drivers.onnx.export import OnnxExport
 
 NAME = "driver.fmu"

@@ -4,10 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cfx.policies.agent import Agent
-from cfx.policies.checkpoint import load_agent
-from cfx.policies.driver_step import DriverStep
-from cfx.results.tracker import folder_of
+from cfx.plugin import Agent, DriverStep, folder_of, load_agent
 
 
 def driver_step(driver: str | Path | Agent) -> DriverStep:

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from cfx.policies.agent import Agent
+from cfx.plugin import Agent
 from cfx_drivers.gym.vector import Array, CarFollowingVectorEnv, Outcome, as_recorded, of_first
 
 

@@ -21,11 +21,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 import cfx
-from cfx import PairBatch, PairSet
 from cfx.errors import ConfigError, DataError
-from cfx.models.limits import LimitSettings, limited_speed
-from cfx.policies.agent import Agent
-from cfx.policies.driver_step import Motion
+from cfx.plugin import Agent, LimitSettings, Motion, PairBatch, PairSet, limited_speed
 from cfx_drivers.gym.drawing import picture
 from cfx_drivers.gym.drivers import driver_step
 

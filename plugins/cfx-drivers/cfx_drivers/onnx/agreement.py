@@ -9,7 +9,7 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
-from cfx.policies.driver_step import DriverState, DriverStep, Motion
+from cfx.plugin import DriverState, DriverStep, Motion
 from cfx_drivers.onnx.graph import SIGNALS, kept_of
 
 VEHICLES, STEPS, LENGTH_M = 5, 300, 5.0

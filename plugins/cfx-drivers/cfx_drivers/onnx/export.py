@@ -10,14 +10,16 @@ from pathlib import Path
 
 import torch
 
-from cfx.core.command import ExportFormat
-from cfx.core.files import write_output
 from cfx.errors import ConfigError, DataError
-from cfx.policies.agent import Agent
-from cfx.policies.checkpoint import load_agent
-from cfx.policies.core import ANY_DRIVER
-from cfx.policies.driver_step import DriverStep
-from cfx.results.tracker import folder_of
+from cfx.plugin import (
+    ANY_DRIVER,
+    Agent,
+    DriverStep,
+    ExportFormat,
+    folder_of,
+    load_agent,
+    write_output,
+)
 from cfx_drivers.onnx.agreement import largest_difference
 from cfx_drivers.onnx.card import card
 from cfx_drivers.onnx.graph import graph_of

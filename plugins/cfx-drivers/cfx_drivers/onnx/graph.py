@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 import cfx
 from cfx.errors import ConfigError
-from cfx.policies.driver_step import DriverState, DriverStep, Motion
+from cfx.plugin import DriverState, DriverStep, Motion
 
 OPSET = 20
 

@@ -10,18 +10,21 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cfx.evaluation.metrics.base import RECORDED
-from cfx.figures.canvas import (
+from cfx.plugin import (
+    BAND,
+    EDGE,
+    RECORDED,
     Array,
+    JobFigure,
     Line,
+    Results,
     canvas,
     draw_lines,
     mark_points,
+    method_label,
     method_legend,
     styled,
 )
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import BAND, EDGE, label
 from cfx_forecasts.traffic.summary import binned, mean_growth, ring_means, traffic_methods
 
 DENSITY_TITLE = "density (vehicles/km)"
@@ -240,7 +243,7 @@ def draw_paths(panels: Sequence[PathPanel]) -> Figure:
             vmax=max(fastest, 1.0),
             rasterized=True,
         )
-        axes.set_title(label(panel.method))
+        axes.set_title(method_label(panel.method))
         axes.grid(visible=False)
         if len(panel.time):
             axes.set_xlim(0.0, float(np.max(panel.time)))

@@ -13,8 +13,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx import PairBatch
-from cfx.evaluation.metrics.base import RECORDED
+from cfx.plugin import RECORDED, PairBatch
 from cfx_forecasts.traffic.edie import PER_HOUR, PER_KM, Strips, region, strips_of
 from cfx_forecasts.traffic.roads import Driven, Lanes, Road
 from cfx_forecasts.traffic.tables import GROWTH_COLUMNS, PATH_COLUMNS, ROAD_COLUMNS, STRIP_COLUMNS

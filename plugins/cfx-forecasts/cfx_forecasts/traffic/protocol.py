@@ -12,18 +12,24 @@ import torch
 from pydantic import AfterValidator, Field, model_validator
 from torch import Tensor
 
-from cfx import Settings
-from cfx.core.memory import require_memory
 from cfx.errors import ConfigError
-from cfx.evaluation.closed_loop import Followers, burnt_in
-from cfx.evaluation.protocols.base import ProtocolContext, ProtocolResult
-from cfx.evaluation.protocols.finished import FoldsOrFinished, FoldsOrFinishedSettings
-from cfx.evaluation.protocols.held_out import HeldOut
-from cfx.policies.agent import Agent, AgentState
-from cfx.policies.constant import FixedPolicy
-from cfx.policies.core import ANY_DRIVER
-from cfx.policies.features import measured_history
-from cfx.simulation.rollout import MemoryStepper
+from cfx.plugin import (
+    ANY_DRIVER,
+    Agent,
+    AgentState,
+    FixedPolicy,
+    FoldsOrFinished,
+    FoldsOrFinishedSettings,
+    Followers,
+    HeldOut,
+    MemoryStepper,
+    ProtocolContext,
+    ProtocolResult,
+    Settings,
+    burnt_in,
+    measured_history,
+    require_memory,
+)
 from cfx_forecasts.noise import can_drive, constant_with_noise, residual_noise
 from cfx_forecasts.traffic.measure import UPSTREAM_M, Measured, traffic_of
 from cfx_forecasts.traffic.roads import (

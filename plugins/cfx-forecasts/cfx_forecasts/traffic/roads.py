@@ -17,13 +17,19 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx import Start
-from cfx.core.threads import one_thread
-from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.models.composed import LIMIT, WithSpeedLimit
-from cfx.policies.agent import Agent, AgentState
-from cfx.policies.features import History
-from cfx.simulation.rollout import MemoryStepper
+from cfx.plugin import (
+    SPEED_LIMIT,
+    Agent,
+    AgentState,
+    DrivingModel,
+    Follower,
+    History,
+    Leader,
+    MemoryStepper,
+    Start,
+    WithSpeedLimit,
+    one_thread,
+)
 
 RoadKind = Literal["ring", "open", "platoon"]
 
@@ -352,7 +358,7 @@ def simulate_roads(
         outside += state.score > 1.0
         p = agent.space.unpack(chosen)
         for _ in range(windows.stride):
-            p[LIMIT] = lanes.limit(follower.position)
+            p[SPEED_LIMIT] = lanes.limit(follower.position)
             now = Leader(
                 ahead.position[None], ahead.speed[None], ahead.acceleration[None], ahead.length
             )

@@ -9,8 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.evaluation.metrics.base import RECORDED, key_of
-from cfx.figures.job import Job
+from cfx.plugin import RECORDED, Job, key_of
 from cfx_forecasts.traffic.summary import traffic_methods
 from cfx_report.jobs import Runs
 from cfx_report.section import Cell, Column, Section, Sheet, method_cell, methods_explained, number

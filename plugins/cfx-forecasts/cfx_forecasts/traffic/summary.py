@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from cfx.evaluation.metrics.base import RECORDED
+from cfx.plugin import RECORDED
 
 TRAFFIC_METHODS = (
     "population",

@@ -7,9 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from rich.table import Table
 
-from cfx import Column, Findings, ResultTable
-from cfx.evaluation.metrics.base import RECORDED
-from cfx.results.table import metrics_table
+from cfx.plugin import RECORDED, Column, Findings, ResultTable, metrics_table
 from cfx_forecasts.traffic.summary import traffic_methods, traffic_metrics
 
 METHOD = Column("method", "", "what drives", "text")

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.figures.figure import Results, draw, figure_named
-from cfx.figures.text import MINUS, label
+from cfx.figures.figure import Results, draw_figure, figure_named
+from cfx.figures.text import MINUS, method_label
 from cfx_forecasts.traffic.figures import draw_paths, draw_traffic, path_panels, traffic_panels
 from cfx_forecasts.traffic.section import traffic_sheet
 from cfx_forecasts.traffic.summary import traffic_methods, traffic_metrics
@@ -76,7 +76,7 @@ def test_traffic_has_lines_points_and_a_panel_of_paths_per_method() -> None:
     assert len(without) == 3
     rings = draw_paths(path_panels(paths, methods))
     assert [axes.get_title(loc="left") for axes in rings.axes[:3]] == [
-        label(method) for method in methods
+        method_label(method) for method in methods
     ]
 
 
@@ -109,5 +109,5 @@ def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
 def test_each_figure_is_drawn_where_there_is_traffic_and_nowhere_else(name: str) -> None:
     one = figure_named(name)
     evaluation = make_results(pairs=3, frames=20).evaluation
-    assert draw(one, Results.of(evaluation)) is None
-    assert draw(one, Results.of(evaluation, tables=make_traffic())) is not None
+    assert draw_figure(one, Results.of(evaluation)) is None
+    assert draw_figure(one, Results.of(evaluation, tables=make_traffic())) is not None

@@ -88,7 +88,7 @@ def test_traffic_stands_in_every_table(result: cfx.JobResult) -> None:
     assert result.evaluation is not None
     console = Console(file=io.StringIO(), width=80)
     findings = Findings(
-        cfx.PairSet((), ""),
+        cfx.plugin.PairSet((), ""),
         cast(Any, None),
         ProtocolResult(result.evaluation, result.policy, pd.DataFrame(), None),
     )

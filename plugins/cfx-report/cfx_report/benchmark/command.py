@@ -7,7 +7,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from cfx import Command
+from cfx.plugin import Command
 from cfx_report.benchmark.frozen import DATA_NAME, METHODS, VERSION, protocol_hash
 
 

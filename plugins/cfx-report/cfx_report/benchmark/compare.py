@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from cfx.errors import DataError
-from cfx.evaluation.statistics import Improvement, improvement_statistics
+from cfx.plugin import Improvement, improvement_statistics
 from cfx_report.benchmark.row import COUNTS
 
 _NEEDED = ("row", "pair_id", "driver")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from pathlib import Path
 
-from cfx import Command
+from cfx.plugin import Command
 from cfx_report.benchmark.recipes import RECIPES
 
 

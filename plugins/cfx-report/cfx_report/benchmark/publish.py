@@ -18,13 +18,19 @@ from typing import Any
 import pandas as pd
 import torch
 
-from cfx.core.files import atomic_write, path_override, write_json
 from cfx.errors import ConfigError, DataError, nearest
-from cfx.policies.agent import Agent
-from cfx.policies.checkpoint import load_agent, save_agent
-from cfx.policies.context import ExpectedError
-from cfx.policies.ready import FOLDER
-from cfx.policies.valid_range import FADED, RANGE_SIGNALS
+from cfx.plugin import (
+    FADED,
+    RANGE_SIGNALS,
+    READY_FOLDER,
+    Agent,
+    ExpectedError,
+    atomic_write,
+    load_agent,
+    path_override,
+    save_agent,
+    write_json,
+)
 from cfx_report.benchmark.recipes import I80, RECIPES
 
 _SOURCES = {
@@ -89,7 +95,7 @@ def publish(name: str, job: Path) -> None:
     agent = load_agent(job / "policy").for_unseen_drivers()
     metrics = json.loads((job / "metrics.json").read_text(encoding="utf-8"))
     data = json.loads((job / "data.json").read_text(encoding="utf-8"))
-    folder = FOLDER / name
+    folder = READY_FOLDER / name
     if folder.is_dir():
         shutil.rmtree(folder)
     save_agent(agent, folder / "policy")

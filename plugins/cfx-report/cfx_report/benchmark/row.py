@@ -10,10 +10,8 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.core.files import write_json
 from cfx.errors import DataError
-from cfx.evaluation.metrics.base import column_of
-from cfx.evaluation.statistics import mean_interval
+from cfx.plugin import column_of, mean_interval, write_json
 from cfx_report.benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash
 
 ROW, PAIRS = "benchmark.json", "benchmark_pairs.csv"

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import cast
 
 import cfx
-from cfx.core.files import atomic_write, path_override
 from cfx.errors import ConfigError, DataError, Terminated, nearest
+from cfx.plugin import atomic_write, path_override
 from cfx_report.benchmark.frozen import DATA, DATA_NAME, FROZEN_KEYS, METHODS, OVERRIDES
 from cfx_report.benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_of
 
@@ -144,7 +144,7 @@ def _require_free(overrides: Sequence[str]) -> None:
 def _fingerprint(data: Path) -> str:
     """Returns the fingerprint of the pairs that the benchmark takes of a file."""
     cls = cfx.get("dataset", "tidy")
-    dataset = cast(cfx.Dataset, cls(path=data, min_duration=30))
+    dataset = cast(cfx.plugin.Dataset, cls(path=data, min_duration=30))
     return dataset.load().fingerprint
 
 
@@ -162,7 +162,7 @@ def _run_job(command: Sequence[str], job: Path) -> None:
             print(f"{job}: was finished before")
             return
         raise ConfigError(f"{job}: holds another job; give --output another folder, or --name")
-    from cfx.app.cli import main
+    from cfx.plugin import main
 
     job.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(list(command)), encoding="utf-8")

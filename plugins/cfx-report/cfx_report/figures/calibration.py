@@ -12,20 +12,31 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from cfx.calibration.identifiability import NEAR, flat_shares
-from cfx.figures.canvas import (
+from cfx.plugin import (
+    EDGE,
+    INK,
+    NEARLY_BEST,
     Array,
+    JobFigure,
+    ParameterAxis,
+    Results,
     canvas,
+    colour_of,
     draw_points,
+    flat_shares,
     legend_above,
+    method_label,
     most_across,
+    number_text,
+    percent,
+    plural,
     points,
+    shortened,
     side_by_side,
     styled,
+    unit_label,
     wrapped,
 )
-from cfx.figures.figure import JobFigure, ParameterAxis, Results
-from cfx.figures.text import EDGE, INK, colour_of, label, number, percent, plural, short, unit_label
 from cfx_report.figures.trajectories import TIME_TITLE
 
 AT_BOUND = 0.01
@@ -139,12 +150,14 @@ def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
     for row, spread in zip(rows, spreads, strict=True):
         axes.vlines((0, 1), row - 0.42, row + 0.42, color=EDGE, linewidth=1)
         places = spread.places(spread.values)
-        named = {method: label(method) if row == 0 else "" for method in ("fixed", "default")}
+        named = {
+            method: method_label(method) if row == 0 else "" for method in ("fixed", "default")
+        }
         aside = row + _WIDTH * spread_offsets(len(places))
         dots: dict[str, Any] = {"alpha": 0.55, "markeredgewidth": 0, "label": named["fixed"]}
         draw_points(axes, places, aside, "o", colour_of("fixed"), 3.2, **dots)
         pooled = spread.places(spread.pooled)
-        said = label("population") if row == 0 and len(pooled) else ""
+        said = method_label("population") if row == 0 and len(pooled) else ""
         rows_of_it = np.full(len(pooled), row)
         draw_points(axes, pooled, rows_of_it, "D", colour_of("population"), 6, label=said)
         default, bar = spread.places(np.array([spread.default])), {"markeredgewidth": 2.2}
@@ -171,7 +184,7 @@ def _ends(axes: Axes, spread: ParameterSpread, row: float) -> None:
         (1.02, spread.axis.high, spread.at_high, "left"),
     ):
         assert bound is not None
-        text = number(bound)
+        text = number_text(bound)
         if share > 0:
             text += f"\n{percent(share).lstrip('+')}"
         axes.text(place, row, text, ha=side, va="center", fontsize=points(8.5), color=INK)
@@ -357,10 +370,10 @@ def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
     for place, panel in zip(grid.flat, panels, strict=False):
         place.plot(panel.places, panel.lines.T, color=colour_of("fixed"), alpha=0.15, linewidth=0.8)
         place.plot(panel.places, panel.median, color=INK, linewidth=2)
-        place.axhline(1 + NEAR, color=EDGE, linestyle="--", linewidth=1)
+        place.axhline(1 + NEARLY_BEST, color=EDGE, linestyle="--", linewidth=1)
         share = percent(panel.near).lstrip("+")
         place.set_title(f"{unit_label(panel.axis.name, panel.axis.unit)}: {share}")
-        ends = [number(panel.values[0]), number(panel.values[-1])]
+        ends = [number_text(panel.values[0]), number_text(panel.values[-1])]
         place.set_xticks([0, 1], ends)
         place.set_ylim(0.97, HIGHEST)
     for unused in grid.flat[len(panels) :]:
@@ -371,7 +384,7 @@ def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
         wrapped(
             f"one parameter moved from bound to bound, the others held; {drivers} and their median."
             " Percentages: the range on which\na pair's loss is within"
-            f" {percent(NEAR).lstrip('+')} of its best (dashed), median over pairs"
+            f" {percent(NEARLY_BEST).lstrip('+')} of its best (dashed), median over pairs"
         ),
         fontsize=points(10.5),
         color=INK,
@@ -394,7 +407,9 @@ def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
         size, above, filled = (4.5, 3, colour) if own else (5.5, 2, "none")
         drawn = draw_points(axes, train, test, _MARKERS[method], colour, size, alpha=0.65)
         drawn.set(
-            label=wrapped(f"{label(method)}: {medians}"), zorder=above, markerfacecolor=filled
+            label=wrapped(f"{method_label(method)}: {medians}"),
+            zorder=above,
+            markerfacecolor=filled,
         )
     end = 1.15 * highest
     axes.plot([0, end], [0, end], color=EDGE, linewidth=1, zorder=1)
@@ -441,8 +456,8 @@ def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis
     grid[-1].set_xlabel(TIME_TITLE)
     figure.suptitle(
         wrapped(
-            f"{short(pair_id)}: per-window calibrated parameters; the paler, the less the choice"
-            " mattered; line: driver-specific"
+            f"{shortened(pair_id)}: per-window calibrated parameters; the paler, the less the"
+            " choice mattered; line: driver-specific"
         ),
         fontsize=points(10.5),
         color=INK,

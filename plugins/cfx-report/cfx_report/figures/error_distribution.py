@@ -9,18 +9,19 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from cfx.figures.canvas import (
+from cfx.plugin import (
     DASHES,
     HIDDEN,
+    JobFigure,
+    Results,
     canvas,
+    colour_of,
     finite,
     method_legend,
     points,
     side_by_side,
     styled,
 )
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import colour_of
 
 _ERRORS = {"rmse_speed": "RMSE of speed (m/s)", "rmse_gap": "RMSE of gap (m)"}
 _FEWEST = 3

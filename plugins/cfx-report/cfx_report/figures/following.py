@@ -6,18 +6,21 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from cfx.evaluation.result import PairTrajectory
-from cfx.figures.canvas import (
+from cfx.plugin import (
     DASHES,
+    EDGE,
     HIDDEN,
+    JobFigure,
+    PairTrajectory,
+    Results,
     canvas,
+    colour_of,
     method_legend,
     most_across,
     points,
+    shortened,
     styled,
 )
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import EDGE, colour_of, short
 from cfx_report.figures.trajectories import chosen_pairs
 
 _PAIRS = 3
@@ -47,7 +50,7 @@ def draw_following(trajectories: Sequence[PairTrajectory], methods: Sequence[str
                 linewidth=points(1.4),
             )
         axes.axvline(0, color=EDGE, linewidth=points(0.9))
-        axes.set_title(short(trajectory.pair_id))
+        axes.set_title(shortened(trajectory.pair_id))
         axes.set_xlabel("relative speed (m/s)")
     for row in grid:
         row[0].set_ylabel("gap (m)")

@@ -9,16 +9,19 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.figures.canvas import (
+from cfx.plugin import (
     DASHES,
+    JobFigure,
+    Results,
     canvas,
+    colour_of,
     legend_above,
+    method_label,
     most_across,
     points,
     styled,
+    unit_label,
 )
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import colour_of, label, unit_label
 from cfx_report.figures.calibration import ParameterSpread, parameter_spreads
 
 _ACROSS = 5
@@ -63,7 +66,7 @@ def _histogram(axes: Axes, spread: ParameterSpread) -> None:
         color=colour_of("fixed"),
         edgecolor="white",
         linewidth=points(0.5),
-        label=label("fixed"),
+        label=method_label("fixed"),
     )
     marks = {"default": np.array([spread.default]), "population": spread.pooled}
     for method, values in marks.items():
@@ -73,7 +76,7 @@ def _histogram(axes: Axes, spread: ParameterSpread) -> None:
                 color=colour_of(method),
                 linestyle=DASHES[method],
                 linewidth=points(1.8),
-                label=label(method) if number == 0 else None,
+                label=method_label(method) if number == 0 else None,
             )
     axes.set_xlabel(unit_label(spread.axis.name, spread.axis.unit))
     axes.set_xlim(edges[0], edges[-1])

@@ -12,29 +12,28 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from cfx.evaluation.statistics import Improvement
-from cfx.figures.canvas import (
+from cfx.plugin import (
+    COLOURS,
+    INK,
     Array,
     Dash,
+    Improvement,
+    JobFigure,
+    Results,
     canvas,
+    common_prefix,
     finite,
     hover,
     legend_above,
-    percent_axis,
-    points,
-    say,
-    styled,
-)
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import (
-    COLOURS,
-    INK,
-    common_prefix,
-    label,
+    method_label,
     percent,
+    percent_axis,
     percent_or_undefined,
     plural,
-    short,
+    points,
+    shortened,
+    styled,
+    write_note,
 )
 
 WORST_WITHOUT_CUT = -0.6
@@ -96,7 +95,7 @@ class ImprovementBars:
 
 def improvement_title(baseline: str) -> str:
     """Returns what an axis of improvements over a baseline is called."""
-    return f"improvement of the RMSE of speed over {label(baseline)}"
+    return f"improvement of the RMSE of speed over {method_label(baseline)}"
 
 
 def improvement_axis(
@@ -204,7 +203,7 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
     prefix = common_prefix(list(series.pair_ids))
     ticks = []
     for name in series.pair_ids:
-        ticks.append(short(name.removeprefix(prefix), 16))
+        ticks.append(shortened(name.removeprefix(prefix), 16))
     longest = max(map(len, ticks), default=0) if named else 0
     figure = canvas(4.3 + 0.075 * longest)
     axes = figure.subplots()
@@ -223,7 +222,7 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
         axes.set_xticks([])
     axes.set_xlabel(_pairs_title(bars, prefix if named else ""))
     if not count:
-        say(axes, "no pair has a defined improvement")
+        write_note(axes, "no pair has a defined improvement")
     legend_above(figure, handles, columnspacing=1.8, handlelength=1.8)
     return figure
 
@@ -260,7 +259,7 @@ def _closer(series: ImprovementSeries) -> list[Line2D | Patch]:
     others = len(series.values) - policy
     return [
         Patch(color=COLOURS["policy"], label=f"policy closer to the driver: {policy}"),
-        Patch(color=COLOURS["fixed"], label=f"{label('fixed')} closer, or equal: {others}"),
+        Patch(color=COLOURS["fixed"], label=f"{method_label('fixed')} closer, or equal: {others}"),
     ]
 
 
@@ -290,7 +289,7 @@ def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | P
 def _pairs_title(bars: ImprovementBars, prefix: str) -> str:
     title = plural(len(bars.series[0].values), "pair")
     if prefix:
-        title += f" of {short(prefix.rstrip('_-/:.'), 30)}"
+        title += f" of {shortened(prefix.rstrip('_-/:.'), 30)}"
     title += ", best to worst"
     if bars.undefined:
         title += f"; {bars.undefined} without a defined improvement"
@@ -347,7 +346,7 @@ def history_curves(history: pd.DataFrame) -> pd.DataFrame:
         A row per base and amount, each in its order: `base`, `amount`, `mean`, `low` and `high`
         (fractions; mean over pairs and its 95 % interval), `pairs` with a defined improvement.
     """
-    from cfx.evaluation.statistics import mean_interval  # imports scipy
+    from cfx.plugin import mean_interval  # imports scipy
 
     rows = []
     for base in sorted(history["base"].unique(), key=_place_of_base):

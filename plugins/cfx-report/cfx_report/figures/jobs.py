@@ -12,29 +12,27 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
-from cfx.data.style import CLUSTERS
-from cfx.evaluation.statistics import Improvement
-from cfx.figures.canvas import (
+from cfx.plugin import (
+    CLUSTERS,
+    INK,
+    JOB_COLOURS,
     Array,
+    Improvement,
     canvas,
+    colour_of,
+    common_prefix,
     draw_points,
     finite,
     hover,
     legend_above,
-    percent_tick,
-    points,
-    styled,
-)
-from cfx.figures.text import (
-    INK,
-    JOB_COLOURS,
-    colour_of,
-    common_prefix,
-    label,
-    number,
+    method_label,
+    number_text,
     percent_or_undefined,
+    percent_tick,
     plural,
-    short,
+    points,
+    shortened,
+    styled,
 )
 from cfx_report.figures.calibration import spread_offsets
 from cfx_report.figures.improvements import (
@@ -104,8 +102,11 @@ def error_limit(values: Mapping[str, Array], unit: str) -> tuple[float, str]:
     beyond = far[far > _WIDE * largest]
     if not len(beyond):
         return 1.06 * max(largest, float(far.max(initial=0.0))), ""
-    jobs, most = plural(len(beyond), "job"), number(float(beyond.max()))
-    return _WIDE * largest, f"{jobs} with {label('default')} further off, up to {most} {unit}."
+    jobs, most = plural(len(beyond), "job"), number_text(float(beyond.max()))
+    return (
+        _WIDE * largest,
+        f"{jobs} with {method_label('default')} further off, up to {most} {unit}.",
+    )
 
 
 @styled
@@ -154,10 +155,10 @@ def draw_error_dots(
     handles = []
     for method, errors in values.items():
         marker = "D" if method == "policy" else "o"
-        handles.append(_mark(marker, colour_of(method), label(method)))
+        handles.append(_mark(marker, colour_of(method), method_label(method)))
         for job, value, place in zip(jobs, errors, places, strict=True):
             mark = draw_points(axes, [value], [place], marker, colour_of(method), 8)
-            hover(mark, f"{job}, {label(method)}: {value:.3f} {unit}")
+            hover(mark, f"{job}, {method_label(method)}: {value:.3f} {unit}")
     axes.set_xlim(0, error_limit(values, unit)[0])
     axes.set_xlabel(f"{what} ({unit})")
     legend_above(figure, handles, 5)
@@ -177,7 +178,7 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: ImprovementAxis) -> Figu
     handles = []
     for k, group in enumerate(groups):
         colour = JOB_COLOURS[k % len(JOB_COLOURS)]
-        handles.append(Patch(color=colour, label=short(group.name, 60)))
+        handles.append(Patch(color=colour, label=shortened(group.name, 60)))
         for place, cluster in enumerate(order):
             inside = np.array([one == cluster for one in group.clusters], dtype=bool)
             values = finite(group.values[inside])
@@ -225,7 +226,7 @@ def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
     """
     named = len(pair_ids) <= _NAMED
     prefix = common_prefix(list(pair_ids)) if named else ""
-    ticks = [short(pair.removeprefix(prefix), 18) for pair in pair_ids] if named else []
+    ticks = [shortened(pair.removeprefix(prefix), 18) for pair in pair_ids] if named else []
     figure = canvas(4.3 + 0.075 * max(map(len, ticks), default=0))
     axes = figure.subplots()
     place_of = {pair: place for place, pair in enumerate(pair_ids)}
@@ -237,7 +238,7 @@ def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
         marker = _MARKERS[(k // len(JOB_COLOURS)) % len(_MARKERS)]
         aside = (k - 0.5 * (len(bars.series) - 1)) * width
         places = np.array([place_of[pair] for pair in series.pair_ids], dtype=float) + aside
-        named_as = short(series.name, 60)
+        named_as = shortened(series.name, 60)
         if as_bars:
             drawn = axes.bar(places, series.shown, width=width, color=colour)
             for bar, pair, value in zip(drawn, series.pair_ids, series.values, strict=True):
@@ -253,7 +254,7 @@ def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
     axes.set_xlim(-0.7, max(len(pair_ids), 8) - 0.3)
     axes.set_xticks(range(len(ticks)), ticks, rotation=90, fontsize=points(8.5))
     axes.grid(visible=False, axis="x")
-    of_what = f" of {short(prefix.rstrip('_-/:.'), 30)}" if prefix else ""
+    of_what = f" of {shortened(prefix.rstrip('_-/:.'), 30)}" if prefix else ""
     axes.set_xlabel(f"{plural(len(pair_ids), 'pair')} of a leader and a follower{of_what}")
     vertical_improvements(axes, bars.axis)
     legend_above(figure, handles)
@@ -265,7 +266,7 @@ def _by_job(jobs: Sequence[str]) -> tuple[Figure, Axes, Array]:
     figure = canvas(1.35 + 0.34 * len(jobs))
     axes = figure.subplots()
     places = np.arange(len(jobs), dtype=np.float64)
-    axes.set_yticks(places, [short(job, 60) for job in jobs])
+    axes.set_yticks(places, [shortened(job, 60) for job in jobs])
     axes.set_ylim(len(jobs) - 0.4, -0.6)
     axes.tick_params(axis="y", length=0)
     return figure, axes, places

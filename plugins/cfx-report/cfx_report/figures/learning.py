@@ -7,10 +7,21 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
-from cfx.figures.canvas import Array, canvas, legend_above, plain_tick, say, styled
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import EDGE, TRAIN_COLOUR, VALIDATION_COLOUR
-from cfx.learners.curves import first_sampled_epoch, over_networks
+from cfx.plugin import (
+    EDGE,
+    TRAIN_COLOUR,
+    VALIDATION_COLOUR,
+    Array,
+    JobFigure,
+    Results,
+    canvas,
+    first_sampled_epoch,
+    legend_above,
+    over_networks,
+    plain_tick,
+    styled,
+    write_note,
+)
 
 LOSS_TITLE = "loss (as the learner defines it)"
 SAMPLED = "training counts sampled paths, too (CRPS)"
@@ -101,7 +112,7 @@ def draw_learning(curves: pd.DataFrame) -> Figure:
     axes.set_ylabel(LOSS_TITLE)
     axes.margins(x=0.01)
     if not losses:
-        say(axes, "no loss was measured")
+        write_note(axes, "no loss was measured")
     elif len(next(iter(losses.values()))) == 1:
         axes.set_xticks([int(curves["epoch"].iloc[0])])
     title = f"{networks} networks: median and quartiles" if networks > 1 else "one network"

@@ -8,10 +8,19 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cfx.evaluation.headline import opposite
-from cfx.evaluation.statistics import Against
-from cfx.figures.canvas import canvas, draw_points, most_across, points, styled, wrapped
-from cfx.figures.text import EDGE, JOB_COLOURS, percent
+from cfx.plugin import (
+    EDGE,
+    JOB_COLOURS,
+    Against,
+    canvas,
+    draw_points,
+    most_across,
+    opposite,
+    percent,
+    points,
+    styled,
+    wrapped,
+)
 
 _ACROSS = 3
 _MOST = 6

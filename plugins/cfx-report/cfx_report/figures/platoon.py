@@ -11,19 +11,23 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cfx.evaluation.metrics.base import key_of
-from cfx.figures.canvas import (
+from cfx.plugin import (
+    COLLISION_COLOUR,
+    COLOURS,
     Array,
+    JobFigure,
+    Results,
     canvas,
     finite,
+    key_of,
     legend_above,
+    method_label,
+    number_text,
     points,
     side_by_side,
     styled,
     vehicle_colour,
 )
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import COLLISION_COLOUR, COLOURS, label, number
 
 TIME_TITLE = "time from the braking of the leader (s)"
 
@@ -76,7 +80,7 @@ def _slowing(rows: pd.DataFrame) -> str:
     last = _drop(after[after["vehicle"] == after["vehicle"].max()])
     if not (leader > 0 and np.isfinite(last)):
         return "not defined"
-    return f"{number(last / leader)} times the leader's drop"
+    return f"{number_text(last / leader)} times the leader's drop"
 
 
 def _drop(rows: pd.DataFrame) -> float:
@@ -104,7 +108,7 @@ def draw_platoons(
     for axes, method in zip(grid, methods, strict=True):
         of_method = table[table["method"] == method]
         rows, _ = worst_platoon(of_method)
-        title = [label(method)]
+        title = [method_label(method)]
         if method in stable:
             title.append(_stability(stable[method], int(of_method["network"].nunique())))
         title.append(f"last follower: {_slowing(rows)}")

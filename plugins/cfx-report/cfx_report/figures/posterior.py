@@ -11,10 +11,26 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.calibration.settings import DETERMINED, LEVEL, reliable
-from cfx.figures.canvas import canvas, legend_above, most_across, points, styled, wrapped
-from cfx.figures.figure import JobFigure, ParameterAxis, Results
-from cfx.figures.text import EDGE, INK, colour_of, plural, short, unit_label
+from cfx.plugin import (
+    EDGE,
+    INK,
+    INTERVAL_LEVEL,
+    MIN_NARROWING,
+    JobFigure,
+    ParameterAxis,
+    Results,
+    are_reliable,
+    canvas,
+    colour_of,
+    legend_above,
+    most_across,
+    plural,
+    points,
+    shortened,
+    styled,
+    unit_label,
+    wrapped,
+)
 
 _ACROSS = 5
 
@@ -67,8 +83,8 @@ def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
 def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
     ordered = rows.sort_values(f"median_{axis.name}")
     number = np.arange(len(ordered))
-    good = reliable(ordered).to_numpy(dtype=bool)
-    known = ordered[f"contraction_{axis.name}"].to_numpy(dtype=float) >= DETERMINED
+    good = are_reliable(ordered).to_numpy(dtype=bool)
+    known = ordered[f"contraction_{axis.name}"].to_numpy(dtype=float) >= MIN_NARROWING
     kinds = (good & known, good & ~known, ~good)
     low, middle, high = (
         ordered[f"{kind}_{axis.name}"].to_numpy(dtype=float) for kind in ("low", "median", "high")
@@ -136,7 +152,7 @@ def draw_pairs(
         grid[number, 0].set_ylabel(named if number else "draws", fontsize=points(9))
     handles, _ = grid[0, 0].get_legend_handles_labels()
     legend_above(figure, handles)
-    said = wrapped(f"{short(pair_id)}: {plural(len(draws), 'draw')} from the posterior")
+    said = wrapped(f"{shortened(pair_id)}: {plural(len(draws), 'draw')} from the posterior")
     figure.supxlabel(said, fontsize=points(10.5), color=INK)
     return figure
 
@@ -181,7 +197,13 @@ def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
     )
     colour = colour_of("fixed")
     place.fill_between(
-        time, low, high, color=colour, alpha=0.3, linewidth=0, label=f"{LEVEL:.0%} of trajectories"
+        time,
+        low,
+        high,
+        color=colour,
+        alpha=0.3,
+        linewidth=0,
+        label=f"{INTERVAL_LEVEL:.0%} of trajectories",
     )
     place.plot(time, middle, color=colour, label="median")
     place.plot(time, measured, color=INK, label="recorded")
@@ -189,9 +211,10 @@ def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
     if after.any():
         held = (low <= measured) & (measured <= high)
         place.axvline(time[after][0], color=EDGE, linestyle="--", linewidth=1)
-        say = f"{short(pair_id)}: {held[after].mean():.0%} of the steps after the dashed line held"
+        share = held[after].mean()
+        say = f"{shortened(pair_id)}: {share:.0%} of the steps after the dashed line held"
     else:
-        say = short(pair_id)
+        say = shortened(pair_id)
     place.set_xlabel("time from the start of the pair (s)")
     signal = str(rows["signal"].iloc[0])
     place.set_ylabel(unit_label(signal, {"speed": "m/s", "gap": "m"}[signal]))
@@ -216,11 +239,12 @@ def _middle(rows: pd.DataFrame) -> str:
 class PosteriorIntervals(JobFigure):
     """Intervals of each parameter of all drivers."""
 
-    title = f"{LEVEL:.0%} intervals of each driver's parameters"
+    title = f"{INTERVAL_LEVEL:.0%} intervals of each driver's parameters"
     caption = (
-        f"What each recording says of its driver's parameters: {LEVEL:.0%} intervals between the"
-        " bounds (dashed). Above each panel: for how many pairs the recording determines the"
-        f" parameter, so that the interval is at least {DETERMINED:.0%} narrower than before."
+        f"What each recording says of its driver's parameters: {INTERVAL_LEVEL:.0%} intervals"
+        " between the bounds (dashed). Above each panel: for how many pairs the recording"
+        " determines the parameter, so that the interval is at least"
+        f" {MIN_NARROWING:.0%} narrower than before."
     )
     order = 133
 
@@ -263,9 +287,9 @@ class PosteriorFan(JobFigure):
 
     title = "Trajectories of one driver's posterior"
     caption = (
-        f"The middle {LEVEL:.0%} of the trajectories of the same driver's posterior, and what was"
-        " recorded. Up to the dashed line they are simulated, on the part that was calibrated on."
-        " After it they are forecasts, with noise that goes on from the last error."
+        f"The middle {INTERVAL_LEVEL:.0%} of the trajectories of the same driver's posterior, and"
+        " what was recorded. Up to the dashed line they are simulated, on the part that was"
+        " calibrated on. After it they are forecasts, with noise that goes on from the last error."
     )
     order = 135
 

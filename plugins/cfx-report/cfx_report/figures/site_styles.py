@@ -10,10 +10,24 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.data.style import ALL_TYPES, INDICATORS, Group, StyleResult, groups, name_of_indicator
-from cfx.figures.canvas import Array, canvas, hover, most_across, points, styled
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import INK, JOB_COLOURS
+from cfx.plugin import (
+    ALL_TYPES,
+    INDICATORS,
+    INK,
+    JOB_COLOURS,
+    Array,
+    Group,
+    JobFigure,
+    Results,
+    StyleResult,
+    canvas,
+    groups,
+    hover,
+    most_across,
+    name_of_indicator,
+    points,
+    styled,
+)
 
 _ACROSS = 4
 _VIOLIN = 8

@@ -8,10 +8,18 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from cfx.evaluation.sites import ALL_SITES
-from cfx.figures.canvas import canvas, hover, percent_tick
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import COLOURS, INK, label, percent
+from cfx.plugin import (
+    ALL_SITES,
+    COLOURS,
+    INK,
+    JobFigure,
+    Results,
+    canvas,
+    hover,
+    method_label,
+    percent,
+    percent_tick,
+)
 
 _PANELS = (("test", "fixed"), ("full_trajectory", "population"))
 """Which part of trajectories is compared with what, one panel each."""
@@ -40,7 +48,7 @@ def draw_sites(sites: pd.DataFrame) -> Figure | None:
     for panel, (scope, baseline) in zip(axes, panels, strict=True):
         _panel(panel, sites[sites["scope"] == scope], baseline, names)
         part = "last part" if scope == "test" else "full trajectories"
-        panel.set_title(f"{part}: over {label(baseline)}")
+        panel.set_title(f"{part}: over {method_label(baseline)}")
     axes[0].set_yticks(range(len(names)), [_called(*name) for name in names])
     axes[0].invert_yaxis()
     for tick, (site, kind) in zip(axes[0].get_yticklabels(), names, strict=True):

@@ -9,17 +9,22 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.data.style import CLUSTERS, StyleResult, name_of_indicator
-from cfx.figures.canvas import (
+from cfx.plugin import (
+    CLUSTER_COLOURS,
+    CLUSTERS,
+    INK,
     Array,
+    JobFigure,
+    Results,
+    StyleResult,
     canvas,
     finite,
+    name_of_indicator,
+    plural,
     points,
     side_by_side,
     styled,
 )
-from cfx.figures.figure import JobFigure, Results
-from cfx.figures.text import CLUSTER_COLOURS, INK, plural
 
 
 def score_bins(scores: Array) -> Array:

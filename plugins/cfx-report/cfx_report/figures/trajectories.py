@@ -17,30 +17,30 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from cfx.errors import ConfigError, nearest
-from cfx.evaluation.result import PairTrajectory
-from cfx.figures.canvas import (
-    HIDDEN,
-    Array,
-    Line,
-    canvas,
-    draw_lines,
-    finite,
-    method_legend,
-    most_across,
-    points,
-    styled,
-)
-from cfx.figures.figure import JobFigure, ParameterAxis, Results
-from cfx.figures.text import (
+from cfx.plugin import (
     BAND,
     EDGE,
+    HIDDEN,
     INK,
+    Array,
+    JobFigure,
+    Line,
+    PairTrajectory,
+    ParameterAxis,
+    Results,
+    canvas,
     colour_of,
-    label,
-    number,
+    draw_lines,
+    finite,
+    method_label,
+    method_legend,
+    most_across,
+    number_text,
     percent,
-    short,
+    points,
     short_label,
+    shortened,
+    styled,
     unit_label,
 )
 from cfx_report.figures.improvements import improvement_title
@@ -146,9 +146,9 @@ def _signal_panel(
         if len(far):
             least, most = float(far.min()), float(far.max())
             if most > highest:
-                notes.append((f"default up to {number(most)} {unit} ↑", True))
+                notes.append((f"default up to {number_text(most)} {unit} ↑", True))
             if least < lowest:
-                notes.append((f"default down to {number(least)} {unit} ↓", False))
+                notes.append((f"default down to {number_text(least)} {unit} ↓", False))
             low, high = min(low, max(least, lowest)), max(high, min(most, highest))
         low, high = low - 0.06 * height, high + 0.06 * height
     title = unit_label(name, unit)
@@ -250,11 +250,11 @@ def draw_speeds(
     for axes, method in zip(grid, methods, strict=True):
         simulated = {method: trajectory.speed[method]}
         draw_lines(axes, _lines(trajectory.time, trajectory.real_speed, simulated, [method]))
-        title = f"{label(method)}: RMSE of speed {errors[method]:.3f} m/s"
+        title = f"{method_label(method)}: RMSE of speed {errors[method]:.3f} m/s"
         axes.set_title(title, fontsize=points(9.5), color=INK)
         axes.set_ylabel("speed (m/s)")
     grid[-1].set_xlabel(TIME_TITLE)
-    title = f"pair {short(trajectory.pair_id, 60)}, test part"
+    title = f"pair {shortened(trajectory.pair_id, 60)}, test part"
     method_legend(figure, ["real", *methods], title)
     return figure
 
@@ -283,7 +283,7 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     speeds.xaxis.set_major_locator(MaxNLocator(12 // columns, integer=True))
     for axes in panels:
         axes.tick_params(labelbottom=axes in panels[-columns:])
-    _finish(figure, methods, f"pair {short(pair.pair_id, 60)}")
+    _finish(figure, methods, f"pair {shortened(pair.pair_id, 60)}")
     return figure
 
 
@@ -380,7 +380,7 @@ def _titles_of_parameter(axes: Axes, panel: Panel, length: int) -> None:
     """Writes name, unit and bounds, and below them what the parameter means."""
     title = panel.title
     if panel.bounds is not None:
-        title += f", {number(panel.bounds[0])} to {number(panel.bounds[1])}"
+        title += f", {number_text(panel.bounds[0])} to {number_text(panel.bounds[1])}"
     lines = textwrap.wrap(panel.meaning, length, max_lines=2, placeholder=" …")
     axes.set_title("\n".join(lines), fontsize=points(8), color=INK)
     _above(axes, title, points(6 + 11 * len(lines)), fontsize=points(10.5))
@@ -437,7 +437,7 @@ def drives(results: Results, pair_id: str | Sequence[str] | None = None, count: 
     titles, panels = [], []
     explained: str | None = None
     for ranked, trajectory in chosen_pairs(results, pair_id, count):
-        name = RankedPair(short(ranked.pair_id), ranked.rank, ranked.improvement).title
+        name = RankedPair(shortened(ranked.pair_id), ranked.rank, ranked.improvement).title
         if np.isfinite(ranked.improvement):
             name += f":  {percent(ranked.improvement)}"
             explained = f"percentages: {improvement_title('fixed')}"

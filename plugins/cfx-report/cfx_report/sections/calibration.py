@@ -8,11 +8,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.calibration.identifiability import NEAR
-from cfx.evaluation.result import Purpose
-from cfx.figures.job import Job
-from cfx.figures.text import number as shown
-from cfx.figures.text import short, unit_label
+from cfx.plugin import NEARLY_BEST, Job, Purpose, shortened, unit_label
+from cfx.plugin import number_text as shown
 from cfx_report.figures.calibration import (
     AT_BOUND,
     ParameterSpread,
@@ -78,7 +75,7 @@ def _labels(jobs: Sequence[Job]) -> dict[str, View]:
             axes = job.results.parameters
             drivers = labels_of(job.tables["labels"], job.pairs, axes)
             for pair_id, labels in drivers.items():
-                views[short(pair_id)] = View(draw_labels(pair_id, labels, axes))
+                views[shortened(pair_id)] = View(draw_labels(pair_id, labels, axes))
         if views:
             return views
     return {}
@@ -164,8 +161,8 @@ _COLUMNS: tuple[Column[_Row], ...] = (
     Column(
         "Flat on",
         lambda row: number(row.near, ".0%"),
-        f"Share of the range on which the loss is within {formatted(NEAR, '.0%')} of its best, the"
-        " others held; median over pairs.",
+        f"Share of the range on which the loss is within {formatted(NEARLY_BEST, '.0%')} of its"
+        " best, the others held; median over pairs.",
     ),
     Column(
         "Flat for",

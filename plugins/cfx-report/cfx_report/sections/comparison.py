@@ -11,11 +11,19 @@ from typing import Any
 
 import numpy as np
 
-from cfx.evaluation.metrics.base import MetricInfo
-from cfx.evaluation.result import METHODS, Purpose
-from cfx.figures.canvas import finite
-from cfx.figures.job import Job
-from cfx.figures.text import FULL_TRAJECTORY, STEADY, TEST, explained, percent, short_label
+from cfx.plugin import (
+    FULL_TRAJECTORY,
+    METHODS,
+    STEADY,
+    TEST,
+    Job,
+    MetricInfo,
+    Purpose,
+    explained,
+    finite,
+    percent,
+    short_label,
+)
 from cfx_report.figures.jobs import draw_error_dots, error_limit
 from cfx_report.jobs import (
     Runs,

@@ -7,12 +7,17 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cfx.core.distributions import OWN
-from cfx.core.registry import installed
-from cfx.data.style import ALL_TYPES, name_of_indicator
-from cfx.evaluation.result import Purpose
-from cfx.figures.job import Job
-from cfx.figures.text import percent, plural, short_label
+from cfx.plugin import (
+    ALL_TYPES,
+    OWN,
+    Job,
+    Purpose,
+    installed,
+    name_of_indicator,
+    percent,
+    plural,
+    short_label,
+)
 from cfx_report.figures.improvements import BASE_LABELS, history_curves
 from cfx_report.figures.trajectories import RankedPair, draw_pair, rank_pairs
 from cfx_report.jobs import Runs, are_calibrations, of_purpose

@@ -11,12 +11,16 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from cfx.core.job_folder import without_folders
-from cfx.data.style import CLUSTERS
-from cfx.evaluation.result import Purpose
-from cfx.evaluation.statistics import Improvement
-from cfx.figures.job import Job
-from cfx.figures.text import explained, label, short_label
+from cfx.plugin import (
+    CLUSTERS,
+    Improvement,
+    Job,
+    Purpose,
+    explained,
+    method_label,
+    short_label,
+    without_folders,
+)
 from cfx_report.figures.improvements import improvement_axis, improvement_bars
 from cfx_report.figures.jobs import ClusterGroup, draw_clusters, draw_every_pair
 from cfx_report.jobs import Runs, any_baselines, of_purpose
@@ -59,7 +63,7 @@ def per_driver(jobs: Sequence[Job]) -> dict[str, View]:
     tables = [_keyed(job, jobs) for job in jobs]
     views = {}
     for baseline in any_baselines(jobs):
-        views[f"against {label(baseline)}"] = _view(jobs, tables, baseline)
+        views[f"against {method_label(baseline)}"] = _view(jobs, tables, baseline)
     return views
 
 
@@ -146,7 +150,7 @@ dashed one the mean; the dots are the pairs.</p>
             return None
         baselines = any_baselines(jobs)
         series = cluster_series(jobs)
-        sheets = {label(baseline): clusters(series, baseline) for baseline in baselines}
+        sheets = {method_label(baseline): clusters(series, baseline) for baseline in baselines}
         return {"views": per_cluster(series, baselines), "sheets": sheets}
 
 
@@ -194,7 +198,7 @@ def per_cluster(series: Series, baselines: Sequence[str]) -> dict[str, View]:
                 groups.append(_group(name, pd.concat(tables, ignore_index=True), column))
         every = np.concatenate([np.empty(0), *(group.values for group in groups)])
         axis = improvement_axis(every, baseline=baseline)
-        views[f"against {label(baseline)}"] = View(draw_clusters(groups, axis), axis.note)
+        views[f"against {method_label(baseline)}"] = View(draw_clusters(groups, axis), axis.note)
     return views
 
 
@@ -244,7 +248,7 @@ def statistics(table: pd.DataFrame, baseline: str) -> Improvement:
         table: some rows of `Job.by_pair`.
         baseline: what the policy is compared with.
     """
-    from cfx.evaluation.statistics import improvement_statistics  # imports scipy
+    from cfx.plugin import improvement_statistics  # imports scipy
 
     before = table[f"rmse_speed/{baseline}"].to_numpy(dtype=float)
     after = table["rmse_speed/policy"].to_numpy(dtype=float)

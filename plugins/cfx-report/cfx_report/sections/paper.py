@@ -14,9 +14,7 @@ from importlib import resources
 from operator import itemgetter
 from typing import Any
 
-from cfx.core.job_folder import without_folders
-from cfx.figures.job import Job
-from cfx.figures.text import percent_or_undefined, plural
+from cfx.plugin import Job, percent_or_undefined, plural, without_folders
 from cfx_report.jobs import Runs
 from cfx_report.section import Cell, Column, Section, Sheet, number, text
 

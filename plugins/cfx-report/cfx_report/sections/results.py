@@ -8,11 +8,20 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from cfx.evaluation.metrics.base import SCOPES, MetricInfo
-from cfx.evaluation.result import Purpose
-from cfx.evaluation.statistics import Improvement
-from cfx.figures.job import OUTSIDE, Job
-from cfx.figures.text import FULL_TRAJECTORY, MINUS, TEST, explained, label, short_label
+from cfx.plugin import (
+    FULL_TRAJECTORY,
+    MINUS,
+    OUTSIDE,
+    SCOPES,
+    TEST,
+    Improvement,
+    Job,
+    MetricInfo,
+    Purpose,
+    explained,
+    method_label,
+    short_label,
+)
 from cfx_report.figures.jobs import draw_overview, statistics_axis
 from cfx_report.jobs import Runs, any_baselines, are_calibrations, metric_title, of_purpose
 from cfx_report.section import (
@@ -70,7 +79,7 @@ def overview(jobs: Sequence[Job]) -> dict[str, View]:
                     found[job.name] = job.statistics(baseline, scope)
             axis = statistics_axis(found.values(), baseline)
             drawn = draw_overview(found, baseline, axis)
-            views[f"against {label(baseline)}{suffix}"] = View(drawn, axis.note)
+            views[f"against {method_label(baseline)}{suffix}"] = View(drawn, axis.note)
     return views
 
 

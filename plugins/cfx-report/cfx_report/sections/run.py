@@ -10,10 +10,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from cfx.core.job_folder import without_folders
-from cfx.evaluation.result import Purpose
-from cfx.figures.job import Job
-from cfx.figures.text import NOTHING
+from cfx.plugin import NOTHING, Job, Purpose, without_folders
 from cfx_report.jobs import Runs, are_calibrations
 from cfx_report.section import Column, Section, Sheet
 

@@ -19,10 +19,10 @@ from cfx_report.benchmark.row import Row, errors_of, markdown, protocol_name, va
 from cfx_report.benchmark.run import overrides_of, row_name, run
 
 
-def dataset(name: str, **settings: object) -> cfx.PairSet:
+def dataset(name: str, **settings: object) -> cfx.plugin.PairSet:
     """Returns the pairs of one of cfx's datasets."""
     made = cfx.get("dataset", name)(**settings)
-    assert isinstance(made, cfx.Dataset)
+    assert isinstance(made, cfx.plugin.Dataset)
     return made.load()
 
 

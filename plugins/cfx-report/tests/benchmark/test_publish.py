@@ -9,7 +9,7 @@ import pytest
 
 from cfx.errors import ConfigError
 from cfx.policies.checkpoint import load_agent, save_agent
-from cfx.policies.ready import FOLDER, card_of, names
+from cfx.policies.ready import READY_FOLDER, card_of, names
 from cfx_report.benchmark import publish
 from cfx_report.benchmark.publish import card_text, make
 from cfx_report.benchmark.recipes import RECIPES
@@ -24,12 +24,12 @@ def test_a_finished_job_is_published_without_training(
 ) -> None:
     name = names()[0]
     job, folder = tmp_path / "work" / name, tmp_path / "ready"
-    published = FOLDER / name
+    published = READY_FOLDER / name
     agent = load_agent(published / "policy")
     save_agent(agent, job / "policy")
     (job / "metrics.json").write_text((published / "metrics.json").read_text())
     (job / "data.json").write_text(json.dumps({"fingerprint": "abc"}))
-    monkeypatch.setattr(publish, "FOLDER", folder)
+    monkeypatch.setattr(publish, "READY_FOLDER", folder)
     stress = card_of(name)["stress"]
     monkeypatch.setattr(publish, "_stress", lambda _: stress)
     make([name], tmp_path / "not-needed.parquet", tmp_path / "work")

@@ -17,11 +17,7 @@ from typing import Any, ClassVar
 import pandas as pd
 from pydantic import Field
 
-from cfx import Demo, PairSet, Settings
-from cfx.core.files import atomic_write
-from cfx.evaluation.demo import PAGE
-from cfx.evaluation.result import Evaluation
-from cfx.policies.agent import Agent
+from cfx.plugin import DEMO_PAGE, Agent, Demo, Evaluation, PairSet, Settings, atomic_write
 from cfx_sumo.demo.motorway import read_motorway
 from cfx_sumo.demo.simulated import (
     FinishedJob,
@@ -99,7 +95,7 @@ class SumoDemo(Demo):
         _write_errors(folder / "demo_rmse.csv", simulated)
         in_sumo = evaluation_in_sumo(evaluation, simulated)
         pictures = write_pictures(folder, road, simulated, in_sumo)
-        page = write_page(folder / PAGE, road, simulated, in_sumo, policy, pairs.source)
+        page = write_page(folder / DEMO_PAGE, road, simulated, in_sumo, policy, pairs.source)
         return [page, *pictures, folder / "demo_rmse.csv", folder / "motorway.net.xml"]
 
 

@@ -9,11 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.core.files import atomic_write
-from cfx.evaluation.result import Evaluation
-from cfx.figures.figure import Results
-from cfx.figures.text import COLOURS, label
-from cfx.policies.agent import Agent
+from cfx.plugin import COLOURS, Agent, Evaluation, Results, atomic_write, method_label
 from cfx_report.inline import embedded_json, inline_scripts, security_policy
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
@@ -73,7 +69,7 @@ def render(
         scripts=scripts,
         style=_asset("demo.css"),
         colours={kind: COLOURS[kind] for kind in vehicles},
-        labels={kind: label(kind) for kind in vehicles},
+        labels={kind: method_label(kind) for kind in vehicles},
         content=embedded_json(_content(road, simulated, plots)),
         simulated=simulated,
         plots=plots,
@@ -108,7 +104,7 @@ def _content(
         lanes.append({"width": lane.width, "inner": lane.inner, "shape": shape})
     return {
         "colours": {kind: COLOURS[kind] for kind in ("leader", *FOLLOWERS)},
-        "labels": {kind: label(kind) for kind in FOLLOWERS},
+        "labels": {kind: method_label(kind) for kind in FOLLOWERS},
         "followers": FOLLOWERS,
         "carLength": CAR_LENGTH,
         "lanes": lanes,
@@ -147,7 +143,7 @@ class _Plot(NamedTuple):
     """
 
     svg: str
-    label: str
+    method_label: str
     axes: list[list[float]]
 
 

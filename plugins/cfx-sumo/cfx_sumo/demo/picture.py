@@ -11,10 +11,17 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Patch
 from matplotlib.transforms import Affine2D
 
-from cfx.evaluation.result import Evaluation
-from cfx.figures.canvas import canvas, styled
-from cfx.figures.figure import Results, write_figure
-from cfx.figures.text import COLOURS, INK, label, short
+from cfx.plugin import (
+    COLOURS,
+    INK,
+    Evaluation,
+    Results,
+    canvas,
+    method_label,
+    shortened,
+    styled,
+    write_figure,
+)
 from cfx_report.figures.trajectories import drives
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
@@ -78,8 +85,8 @@ def snapshots(road: Motorway, main: SimulatedPair, together: Sequence[SimulatedP
         axes.spines[["left", "bottom"]].set_visible(False)
     handles = []
     for kind in ("leader", *FOLLOWERS):
-        handles.append(Patch(color=COLOURS[kind], label=label(kind)))
-    name = short(main.pair.pair_id, 50)
+        handles.append(Patch(color=COLOURS[kind], label=method_label(kind)))
+    name = shortened(main.pair.pair_id, 50)
     figure.legend(
         handles=handles,
         loc="outside upper center",
@@ -169,11 +176,11 @@ def _draw_pair(axes: Axes, one: SimulatedPair, frame: int, view: _View, *, named
             zorder=3,
         )
         if named:
-            label = f"{one.gap[kind][frame]:.1f} m".replace("-", "\N{MINUS SIGN}")
+            method_label = f"{one.gap[kind][frame]:.1f} m".replace("-", "\N{MINUS SIGN}")
             axes.text(
                 front[0],
                 front[1] - CAR_LENGTH - 0.8,
-                label,
+                method_label,
                 ha="center",
                 va="top",
                 fontsize=6.5,

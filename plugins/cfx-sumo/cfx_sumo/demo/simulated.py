@@ -15,12 +15,17 @@ import pandas as pd
 import torch
 from numpy.typing import NDArray
 
-from cfx import Pair, PairBatch, PairSet
-from cfx.core.processes import worker_pool
 from cfx.errors import DataError, SumoError
-from cfx.evaluation.result import Evaluation, PairTrajectory
-from cfx.policies.agent import Agent
-from cfx.policies.core import ANY_DRIVER
+from cfx.plugin import (
+    ANY_DRIVER,
+    Agent,
+    Evaluation,
+    Pair,
+    PairBatch,
+    PairSet,
+    PairTrajectory,
+    worker_pool,
+)
 from cfx_report.figures.trajectories import evenly_spread
 from cfx_sumo.demo.motorway import ABREAST, Motorway
 from cfx_sumo.demo.replay import FOLLOWERS, ReplayRequest, replay

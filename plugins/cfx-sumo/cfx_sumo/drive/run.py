@@ -22,9 +22,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from cfx.core.files import atomic_write
-from cfx.core.progress import Task
 from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
+from cfx.plugin import Task, atomic_write
 from cfx_sumo.drive.distributions import members_of
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.installed import require_sumo
@@ -728,11 +727,11 @@ def parse_drivers(given: Sequence[str]) -> dict[str, str]:
 
 def report(run: ScenarioRun) -> None:
     """Prints what happened: tables, and one line about speed."""
-    from cfx.core.console import put
+    from cfx.plugin import print_table
 
-    put(_what_happened(run))
-    put(_braking(run))
-    put(_beside_the_recording(run))
+    print_table(_what_happened(run))
+    print_table(_braking(run))
+    print_table(_beside_the_recording(run))
     for collision in run.collisions[:_LISTED]:
         print(collision)
     if len(run.collisions) > _LISTED:
@@ -819,7 +818,7 @@ def _beside_the_recording(run: ScenarioRun) -> Table:
 
 
 def _table(*columns: str) -> Table:
-    from cfx.core.console import blank_table
+    from cfx.plugin import blank_table
 
     table = blank_table(*columns)
     for column in table.columns[1:]:

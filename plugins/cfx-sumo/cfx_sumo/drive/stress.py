@@ -16,9 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.core.files import write_json
-from cfx.core.progress import Task
 from cfx.errors import SumoError
+from cfx.plugin import Task, write_json
 from cfx_sumo.drive.queue import SECONDS, QueueAtLight, queue_of
 from cfx_sumo.drive.run import command_line, started
 from cfx_sumo.drive.scenarios import ASSETS, CAR, SCENARIOS, STEP_S, Scenario
@@ -209,7 +208,7 @@ def run_town(
 
 def report_stress(result: StressResult, output: Path | None = None) -> None:
     """Prints a table of the events, and writes it as JSON where `output` is given."""
-    from cfx.core.console import blank_table, put
+    from cfx.plugin import blank_table, print_table
 
     table = blank_table(
         "event",
@@ -234,7 +233,7 @@ def report_stress(result: StressResult, output: Path | None = None) -> None:
             f"{one.hardest_acceleration:.2f}",
             f"{one.smallest_gap:.2f}",
         )
-    put(table)
+    print_table(table)
     town = result.town
     print(
         f"A queue at a light lets {town.saturation_flow:.0f} vehicles through an hour of green and"

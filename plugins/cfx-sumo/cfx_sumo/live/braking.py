@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.models.limits import LimitSettings
+from cfx.plugin import LimitSettings
 from cfx_sumo.live.surroundings import Seen
 
 _MARGIN = 1.5

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.simulation.kernel.compiler import build
+from cfx.plugin import build_library
 
 _TEXT = "RKNSt7__cxx1112basic_stringIcSt11char_traitsIcESaIcEEE"
 """A constant reference to a string in the names of C++ functions."""
@@ -134,7 +134,7 @@ def _built() -> Bridge | None:
     found: Any = importlib.import_module("libsumo._libsumo")
     try:
         libsumo = ctypes.CDLL(found.__file__, mode=os.RTLD_NOLOAD)
-        compiled = build(Path(__file__).with_suffix(".cpp").read_text(encoding="utf-8"))
+        compiled = build_library(Path(__file__).with_suffix(".cpp").read_text(encoding="utf-8"))
         return None if compiled is None else Bridge(compiled, libsumo)
     except (AttributeError, OSError):
         return None

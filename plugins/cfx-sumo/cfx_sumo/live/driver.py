@@ -22,24 +22,31 @@ from typing import TypedDict, Unpack, cast
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader
-from cfx.core.job_folder import parse_json
-from cfx.core.registry import create
-from cfx.core.threads import one_thread
 from cfx.errors import DataError, ParameterError, SumoError
-from cfx.models.limits import at_limits
-from cfx.policies.agent import Agent, AgentState
-from cfx.policies.base import ConstantNetwork
-from cfx.policies.checkpoint import load_agent as load_checkpoint
-from cfx.policies.constant import FixedPolicy
-from cfx.policies.context import DriverContext
-from cfx.policies.core import ANY_DRIVER, AgentCore
-from cfx.policies.features import History, Scaler
-from cfx.policies.heads.base import DirectHead
-from cfx.policies.valid_range import share_in_words
-from cfx.results.tracker import folder_of
-from cfx.simulation.settings import WindowSettings
-from cfx.simulation.step import advance_vehicle
+from cfx.plugin import (
+    ANY_DRIVER,
+    Agent,
+    AgentCore,
+    AgentState,
+    ConstantNetwork,
+    DirectHead,
+    DriverContext,
+    DrivingModel,
+    FixedPolicy,
+    Follower,
+    History,
+    Leader,
+    Scaler,
+    WindowSettings,
+    advance_vehicle,
+    at_limits,
+    create,
+    folder_of,
+    one_thread,
+    parse_json,
+    share_in_words,
+)
+from cfx.plugin import load_agent as load_checkpoint
 from cfx_sumo.live.braking import hardest_braking
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.draws import standard_normal

@@ -8,9 +8,8 @@ from typing import Unpack
 
 import torch
 
-from cfx.core.threads import one_thread
 from cfx.errors import DataError
-from cfx.policies.core import ANY_DRIVER
+from cfx.plugin import ANY_DRIVER, one_thread
 from cfx_sumo.live.driver import Driver, DriverOptions, Together
 from cfx_sumo.live.saved import read_state, write_state
 from cfx_sumo.live.surroundings import Connection

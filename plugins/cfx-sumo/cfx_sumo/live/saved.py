@@ -15,8 +15,8 @@ import safetensors.torch
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from cfx.core.files import atomic_write
 from cfx.errors import DataError, OutputError
+from cfx.plugin import atomic_write
 
 _KEY = "cfx_live_drivers"
 """Of the description in the file's metadata."""

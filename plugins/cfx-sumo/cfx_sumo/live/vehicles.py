@@ -12,9 +12,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel
-from cfx.policies.agent import Agent
-from cfx.policies.features import History
+from cfx.plugin import Agent, DrivingModel, History
 
 
 @dataclass(frozen=True)

@@ -12,9 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from xml.etree import ElementTree
 
-from cfx.core.distributions import install_line
 from cfx.errors import ConfigError, SumoError, nearest
-from cfx.models.vtype import VType
+from cfx.plugin import VType, install_line
 from cfx_sumo.installed import DISTRIBUTION
 
 _XS = "{http://www.w3.org/2001/XMLSchema}"

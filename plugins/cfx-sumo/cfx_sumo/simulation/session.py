@@ -14,8 +14,8 @@ from pathlib import Path
 
 from loky.process_executor import BrokenProcessPool, ShutdownExecutorError
 
-from cfx.core.processes import worker_pool
 from cfx.errors import SumoError
+from cfx.plugin import worker_pool
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.simulation.worker import LOG, Answer, Request, answer, begin
 

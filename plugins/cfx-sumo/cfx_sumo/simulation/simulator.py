@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from cfx import DrivingModel, Settings, Simulator, SimulatorSettings, Stepper
+from cfx.plugin import DrivingModel, Settings, Simulator, SimulatorSettings, Stepper
 from cfx_sumo.simulation.stepper import SumoStepper, require_in_sumo
 
 

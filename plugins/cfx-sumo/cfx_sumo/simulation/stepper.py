@@ -11,11 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from cfx import DrivingModel, Follower, Leader, Stepper
-from cfx.core.component import content_key, folder_hash
-from cfx.core.threads import cores
 from cfx.errors import ConfigError, SumoError, listed
-from cfx.models.vtype import InSumo, VType
+from cfx.plugin import (
+    DrivingModel,
+    Follower,
+    InSumo,
+    Leader,
+    Stepper,
+    VType,
+    content_key,
+    cores,
+    folder_hash,
+)
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.limits import lost_limits
 from cfx_sumo.simulation.schema import check_vtype

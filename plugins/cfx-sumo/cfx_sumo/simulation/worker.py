@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.core.distributions import install_line
 from cfx.errors import SumoError
+from cfx.plugin import install_line
 from cfx_sumo.installed import DISTRIBUTION
 from cfx_sumo.simulation.network import FOLLOWER, LANE, LEADER, ROAD, Placed, network, routes
 
