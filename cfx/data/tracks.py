@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfx.data.files import Floats, Ints
-from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.pairs import Dropped, Pair, PairSet, Remark
 
 Marks = NDArray[np.bool_]
 
@@ -48,6 +48,7 @@ class Tracks:
         driver_types: labels.
         names: what vehicle number i is called, at index i; empty: by its number.
         dropped: what has been left out so far.
+        remarks: what was noticed about the source as a whole.
     """
 
     source: str
@@ -67,6 +68,7 @@ class Tracks:
     driver_types: tuple[str, ...] = ()
     names: tuple[str, ...] = ()
     dropped: tuple[Dropped, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
     def __len__(self) -> int:
         return len(self.vehicle)
@@ -130,6 +132,7 @@ def extract_pairs(tracks: Tracks, *, max_gap: float | None = None) -> PairSet:
         tracks.source,
         (*tracks.dropped, *counted(reasons, "rows")),
         counted(_ends(tracks, facts, rows[starts + sizes - 1]), "pairs"),
+        tracks.remarks,
     )
 
 
@@ -191,7 +194,7 @@ class _Facts:
 
     @classmethod
     def of(cls, tracks: Tracks, max_gap: float | None) -> _Facts:
-        ahead, has_row = _rows_of(tracks, tracks.recording, tracks.leader, tracks.frame)
+        ahead, has_row = rows_ahead(tracks)
         if tracks.gap is None:
             in_lane = has_row & (tracks.lane[ahead] == tracks.lane)
             gap = tracks.position[ahead] - tracks.length[ahead] - tracks.position
@@ -227,6 +230,25 @@ class _Facts:
             "the leader is behind its follower (gap of 0 or less)": self.is_behind,
             f"the leader is farther than {self.max_gap:g} m": self.is_far,
         }
+
+
+def rows_ahead(tracks: Tracks) -> tuple[Ints, Marks]:
+    """Returns the row of each row's leader at that frame, 0 if none, and whether there is one."""
+    return _rows_of(tracks, tracks.recording, tracks.leader, tracks.frame)
+
+
+def next_in_lane(tracks: Tracks) -> tuple[Ints, Marks]:
+    """Returns the row of the next vehicle ahead in each row's lane, and whether there is one."""
+    ahead = np.zeros(len(tracks), dtype=np.int64)
+    has_row = np.zeros(len(tracks), dtype=bool)
+    order = np.lexsort((tracks.position, tracks.lane, tracks.frame, tracks.recording))
+    behind, front = order[:-1], order[1:]
+    same = tracks.recording[behind] == tracks.recording[front]
+    same &= tracks.frame[behind] == tracks.frame[front]
+    same &= tracks.lane[behind] == tracks.lane[front]
+    ahead[behind[same]] = front[same]
+    has_row[behind[same]] = True
+    return ahead, has_row
 
 
 def _rows_of(tracks: Tracks, recording: Ints, vehicle: Ints, frame: Ints) -> tuple[Ints, Marks]:

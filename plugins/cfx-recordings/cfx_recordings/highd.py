@@ -5,6 +5,8 @@ R. Krajewski, J. Bock, L. Kloeker and L. Eckstein (2018), The highD Dataset, IEE
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -16,8 +18,9 @@ from cfx.core.errors import DataError
 from cfx.data.base import Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints
 from cfx.data.sites import with_sites
+from cfx.data.statements import Statement, remarks_of
 from cfx.data.table import Column, Layout, Table, read_table
-from cfx.data.tracks import Tracks, extract_pairs
+from cfx.data.tracks import Tracks, extract_pairs, rows_ahead
 
 _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
 
@@ -25,6 +28,12 @@ _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_rec
 def _count(name: str) -> Column:
     return Column(name, whole=True, least=0, wrong="is no whole number from 0 on")
 
+
+_TWICE = {"dhw": "m", "thw": "s", "ttc": "s", "precedingXVelocity": "m/s"}
+"""Columns that follow from others: they are compared with these where they are there."""
+
+_CLOSING_MPS = 0.2
+"""From this relative speed on, which has two decimals, a time to collision says something."""
 
 _TRACK_COLUMNS = Layout(
     "highD's tracks",
@@ -37,6 +46,7 @@ _TRACK_COLUMNS = Layout(
         Column("xAcceleration", "m/s2"),
         _count("precedingId"),
         _count("laneId"),
+        *[Column(name, unit, needed=False, may_be_empty=True) for name, unit in _TWICE.items()],
     ),
 )
 _VEHICLE_COLUMNS = Layout(
@@ -143,7 +153,7 @@ def _tracks(path: Path, about: Table) -> Tracks:
     _check(table, speed)
     order = np.lexsort((numbers["frame"], numbers["id"]))
     front = np.where(to_right, numbers["x"] + numbers["width"], -numbers["x"])
-    return Tracks(
+    tracks = Tracks(
         source=str(path),
         dt=1.0 / float(about.numbers["frameRate"][0]),
         recordings=(f"highd-{path.name.removesuffix(_TRACKS)}",),
@@ -159,6 +169,30 @@ def _tracks(path: Path, about: Table) -> Tracks:
         driver_type=vehicles.kind[row_of][order],
         driver_types=vehicles.kinds,
     )
+    said = {name: numbers[name][order] for name in _TWICE if name in numbers}
+    return replace(tracks, remarks=remarks_of(_said_twice(tracks, said)))
+
+
+def _said_twice(tracks: Tracks, said: Mapping[str, Floats]) -> Iterator[Statement]:
+    """Yields what columns say that follows from others too; 0 stands where nobody is ahead."""
+    ahead, has_row = rows_ahead(tracks)
+    headway = np.where(has_row, tracks.position[ahead] - tracks.position, np.nan)
+    if "precedingXVelocity" in said:
+        speed = np.where(has_row, tracks.speed[ahead], np.nan)
+        leaders = np.abs(said["precedingXVelocity"])
+        yield Statement("precedingXVelocity", leaders, [speed], "the leader's xVelocity", 0.02)
+    if "dhw" not in said:
+        return
+    gap = headway - tracks.length[ahead]
+    yield Statement("dhw", said["dhw"], [headway, gap], "x and width of a vehicle and its leader")
+    moves = np.where(tracks.speed > 0, tracks.speed, np.nan)
+    if "thw" in said:
+        yield Statement("thw", said["thw"], [said["dhw"] / moves], "dhw and xVelocity", 0.02)
+    if "ttc" in said:
+        closing = np.abs(np.where(has_row, tracks.speed - tracks.speed[ahead], np.nan))
+        until = said["dhw"] / np.where(closing > _CLOSING_MPS, closing, np.nan)
+        basis = "dhw and xVelocity of a vehicle and its leader"
+        yield Statement("ttc", np.abs(said["ttc"]), [until], basis, 0.02)
 
 
 def _beside(path: Path, ending: str) -> Path:

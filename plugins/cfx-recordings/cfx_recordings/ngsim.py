@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -24,8 +24,9 @@ from cfx.core.errors import DataError, listed, nearest
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
 from cfx.data.pairs import Dropped, PairSet
+from cfx.data.statements import Statement, remarks_of
 from cfx.data.table import Column, Labels, Layout, Table, read_table
-from cfx.data.tracks import Tracks, changes, extract_pairs
+from cfx.data.tracks import Tracks, changes, extract_pairs, next_in_lane, rows_ahead
 
 FOOT = 0.3048
 """Metres; exact by definition."""
@@ -65,6 +66,12 @@ MOTORWAY = (*_BEFORE_ZONES, *_AFTER_ZONES)
 _CLOCK, _LOCATION = "Global_Time", "Location"
 """Columns that are used where they are there."""
 
+_HEADWAYS = ("Space_Headway", "Time_Headway")
+"""Columns that follow from others: they are compared with these where they are there."""
+
+_NO_TIME_HEADWAY = 9999.0
+"""s; from here on `Time_Headway` says that the vehicle stands."""
+
 _SPELLINGS = {
     "preceeding": "preceding",
     "precedingvehicle": "preceding",
@@ -72,6 +79,8 @@ _SPELLINGS = {
     "vehiclevelocity": "vvel",
     "acceleration": "vacc",
     "vehicleacceleration": "vacc",
+    "spacehdwy": "spaceheadway",
+    "timehdwy": "timeheadway",
     "length": "vlength",
     "vehiclelength": "vlength",
     "laneidentification": "laneid",
@@ -126,6 +135,8 @@ _LAYOUT = Layout(
         _count("Preceding"),
         Column(_CLOCK, "ms", needed=False),
         Column(_LOCATION, is_name=True, needed=False),
+        Column("Space_Headway", "ft", needed=False, may_be_empty=True),
+        Column("Time_Headway", "s", needed=False, may_be_empty=True),
     ),
     elsewhere={"pairid": "This is the tidy pair layout: use data=tidy."},
     headerless={18: MOTORWAY, 24: (*_BEFORE_ZONES, *_ZONES, *_AFTER_ZONES)},
@@ -223,7 +234,28 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     ordered = {name: values[order] for name, values in columns.items()}
     rows = _rows(str(path), names, places, recording[order], ordered, count, dropped)
     _check_units(rows)
-    return rows
+    return replace(rows, remarks=remarks_of(_said_twice(rows, ordered)))
+
+
+def _said_twice(rows: Rows, columns: Mapping[str, Floats]) -> Iterator[Statement]:
+    """Yields what columns of a file say that follows from others too, in the file's units."""
+    ahead, has_row = rows_ahead(rows)
+    headway = np.where(has_row, rows.position[ahead] - rows.position, np.nan) / FOOT
+    # In the opposite direction of an arterial Local_Y decreases, and who is next is behind.
+    headway[headway < 0] = np.nan
+    following, is_there = next_in_lane(rows)
+    to_next = np.where(is_there, rows.position[following] - rows.position, np.nan) / FOOT
+    basis = "Local_Y and Lane_ID, by which another vehicle is the next ahead"
+    yield Statement("the distance to the Preceding", headway, [to_next], basis)
+    said = columns.get("Space_Headway")
+    if said is None:
+        return
+    yield Statement("Space_Headway", said, [headway], "Local_Y of a vehicle and its Preceding")
+    time_headway = columns.get("Time_Headway")
+    if time_headway is not None:
+        moves = (columns["v_Vel"] > 0) & (time_headway < _NO_TIME_HEADWAY)
+        speed = np.where(moves, columns["v_Vel"], np.nan)
+        yield Statement("Time_Headway", time_headway, [said / speed], "Space_Headway and v_Vel")
 
 
 def _rows(
@@ -339,8 +371,9 @@ def _sorted(
     again = np.flatnonzero(is_same)
     before, after = order[again - 1], order[again]
     differs = np.zeros(len(again), dtype=bool)
-    for values in columns.values():
-        differs |= values[before] != values[after]
+    for name, values in columns.items():
+        if name not in _HEADWAYS:
+            differs |= values[before] != values[after]
     if differs.any():
         first, second = before[differs][0], after[differs][0]
         a, b = sorted((row[first], row[second]))

@@ -10,7 +10,7 @@ import numpy as np
 
 from cfx.core.errors import DataError
 from cfx.data.files import Floats, Ints
-from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.pairs import Dropped, Pair, PairSet, Remark
 from cfx.data.tracks import (
     SINGLE_FRAME,
     Marks,
@@ -66,6 +66,7 @@ def pairs_of(
     source: str,
     *,
     dropped: Sequence[Dropped] = (),
+    remarks: Sequence[Remark] = (),
     max_gap: float | None = None,
 ) -> PairSet:
     """Cuts series into pairs of consecutive frames without missing or impossible values.
@@ -74,6 +75,7 @@ def pairs_of(
     or the gap is 0 or less, or more than `max_gap`.
 
     Args:
+        remarks: what was noticed about the source as a whole.
         max_gap: m; None: leaders may be anywhere ahead.
     """
     pairs: list[Pair] = []
@@ -92,7 +94,7 @@ def pairs_of(
         ends += counted(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
         for start, stop in zip(starts[is_pair].tolist(), stops[is_pair].tolist(), strict=True):
             pairs.append(_pair(one, slice(good[start], good[stop - 1] + 1), seen))
-    return PairSet(tuple(pairs), source, summed(lost), summed(ends))
+    return PairSet(tuple(pairs), source, summed(lost), summed(ends), tuple(remarks))
 
 
 def _left_out(one: Series, max_gap: float | None) -> dict[str, Marks]:

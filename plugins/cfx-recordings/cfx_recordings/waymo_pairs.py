@@ -18,6 +18,7 @@ from cfx import PairSet, Settings
 from cfx.core.errors import DataError
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
+from cfx.data.statements import Statement, remarks_of
 from cfx.data.table import Column, Layout, Table, read_table
 from cfx.data.tracks import changes
 from cfx_recordings.series import Series, frames_at, pairs_of
@@ -29,6 +30,9 @@ AUTOMATED = 0
 """Number of Waymo's own vehicle in every segment."""
 
 _TIME, _LENGTH = "local_time", "length"
+
+_OTHER_SPEEDS = ("position_based_speed", "speed_based_speed")
+"""Speeds of other estimates: they are compared with the one that is used, where they are there."""
 
 
 def _motion(name: str, earlier: str, unit: str) -> Column:
@@ -47,6 +51,7 @@ _LAYOUT = Layout(
         _motion("filter_pos", "processed_position", "m"),
         _motion("filter_speed", "processed_speed", "m/s"),
         _motion("filter_accer", "processed_accer", "m/s2"),
+        *[Column(name, "m/s", needed=False, may_be_empty=True) for name in _OTHER_SPEEDS],
     ),
 )
 
@@ -105,7 +110,13 @@ def _pairs(file: Table) -> PairSet:
         one = _series(file, {name: values[rows] for name, values in numbers.items()})
         if one is not None:
             series.append(one)
-    return pairs_of(series, file.source)
+    statements = []
+    for name in _OTHER_SPEEDS:
+        if name in numbers:
+            statements.append(
+                Statement(name, numbers[name], [numbers["filter_speed"]], "its speed")
+            )
+    return pairs_of(series, file.source, remarks=remarks_of(statements))
 
 
 def _series(file: Table, rows: Mapping[str, Floats]) -> Series | None:

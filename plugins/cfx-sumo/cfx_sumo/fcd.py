@@ -6,7 +6,7 @@ https://sumo.dlr.de/docs/Simulation/Output/FCDOutput.html
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
@@ -16,11 +16,16 @@ from cfx import Dataset, PairSet, Settings
 from cfx.core.errors import DataError, listed
 from cfx.data.base import FileDatasetSettings, joined
 from cfx.data.files import FileStart, Floats, Ints, stem
+from cfx.data.pairs import Remark
+from cfx.data.statements import Statement, remarks_of
 from cfx.data.tracks import NOBODY, Marks, Tracks, counted, extract_pairs
 from cfx_sumo.fcd_lanes import Couples, Lanes
 from cfx_sumo.fcd_rows import FcdRows, is_fcd, read_rows
 
 log = logging.getLogger(__name__)
+
+_ROUNDING = 0.02
+"""m and m/s: by how much two numbers that SUMO writes with two decimals may differ."""
 
 _LENGTH_IS_SUMOS = frozenset({"DEFAULT_VEHTYPE"})
 """vTypes that nobody declared: 5 m long, as SUMO says."""
@@ -130,12 +135,14 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
     length = np.array([lengths_of.get(name, settings.length) for name in types])[kind]
     position, number_of_lane = lanes.position, lanes.lane
     gap: Floats | None = None
+    remarks: tuple[Remark, ...] = ()
     if bool(np.isnan(rows.numbers["leaderGap"]).all()):
         _warn_of_lengths(rows, types, settings)
     else:
         known = {name: number + 1 for number, name in enumerate(names.tolist())}
         named = [known.get(name, NOBODY) for name in rows.texts["leaderID"][order].tolist()]
         by_name = _Ahead(np.array(named), numbers["leaderGap"][kept], length)
+        remarks = remarks_of(_said_twice(lanes, by_name, numbers["leaderSpeed"][kept], dt))
         leader, gap, length = _as_named(lanes, by_name, leader, beside)
         position = lanes.driven(dt)
         number_of_lane = lanes.lane_stints(edges)
@@ -161,7 +168,31 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         driver_types=types,
         names=("", *names.tolist()),
         dropped=(*rows.dropped, *counted(left_out, "rows")),
+        remarks=remarks,
     )
+
+
+def _said_twice(
+    lanes: Lanes, named: _Ahead, leader_speed: Floats, dt: float
+) -> Iterator[Statement]:
+    """Yields what SUMO says of leaders that follows from their own rows too."""
+    at, is_there = lanes.rows_of(named.leader)
+    speed = np.where(is_there, lanes.speed[at], np.nan)
+    yield Statement("leaderSpeed", leader_speed, [speed], "the leader's speed", _ROUNDING)
+    # Vehicles' lengths are not in the file, so changes are compared, over a second.
+    between = np.where(is_there, lanes.position[at] - lanes.position, np.nan)
+    later = max(1, round(1.0 / dt))
+    if len(between) <= later:
+        return
+    same = np.ones(len(between) - later, dtype=bool)
+    for key in (lanes.vehicle, named.leader, lanes.lane, lanes.lane[at]):
+        same &= key[later:] == key[:-later]
+    same &= (lanes.lane[at] == lanes.lane)[later:]
+    same &= lanes.frame[later:] - lanes.frame[:-later] == later
+    said = np.where(same, named.gap[later:] - named.gap[:-later], np.nan)
+    follows = np.where(same, between[later:] - between[:-later], np.nan)
+    basis = "pos of a vehicle and its leader"
+    yield Statement("the change of leaderGap", said, [follows], basis, 2 * _ROUNDING)
 
 
 def _types(rows: FcdRows) -> tuple[tuple[str, ...], Ints]:

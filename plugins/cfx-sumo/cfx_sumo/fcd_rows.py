@@ -24,7 +24,10 @@ from cfx.data.tracks import counted
 _BLOCK = 1 << 20
 
 _NEEDED = ("id", "speed", "pos", "lane")
-_NUMBERS = ("speed", "pos", "acceleration", "leaderGap", "posLat", "x", "y", "angle")
+_NUMBERS = (
+    *("speed", "pos", "acceleration", "leaderGap", "leaderSpeed"),
+    *("posLat", "x", "y", "angle"),
+)
 _TEXTS = ("id", "lane", "type", "leaderID")
 
 _HOW = (
@@ -202,6 +205,7 @@ _LAYOUT = Layout(
         Column("pos", "m", may_be_empty=True),
         Column("acceleration", "m/s2", may_be_empty=True, needed=False),
         Column("leaderGap", "m", may_be_empty=True, needed=False),
+        Column("leaderSpeed", "m/s", may_be_empty=True, needed=False),
         Column("posLat", "m", may_be_empty=True, needed=False),
         Column("x", "m", may_be_empty=True, needed=False),
         Column("y", "m", may_be_empty=True, needed=False),

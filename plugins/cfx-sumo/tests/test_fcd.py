@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import subprocess
 import sys
 import textwrap
@@ -118,6 +119,7 @@ def test_reads_what_sumo_writes(of_sumo: Path) -> None:
     assert len(pairs) > 5
     lengths = {pair.leader_driver_type: pair.leader_length for pair in pairs}
     assert lengths == {"car": 4.3, "truck": 12.0}, "lengths follow from gaps and positions"
+    assert not pairs.remarks
     for pair in pairs:
         moved = np.diff(pair.follower_position)
         # Gaps and speeds are SUMO's own; they belong together to the digits that it writes.
@@ -166,6 +168,25 @@ def test_leaders_are_those_that_sumo_names(
             np.testing.assert_allclose(pair.gap, other, atol=1e-4)
             matched += 1
     assert matched > len(by_name) / 2
+
+
+@pytest.mark.parametrize(
+    ("attribute", "factor", "says"),
+    [
+        ("leaderGap", 1 / 0.3048, "leaderGap is typically 3.28 times .* feet and metres"),
+        ("leaderSpeed", 3.6, r"leaderSpeed is typically 3\.6 times .* km/h and m/s"),
+    ],
+)
+def test_leaders_in_another_unit_are_refused(
+    of_sumo: Path, tmp_path: Path, attribute: str, factor: float, says: str
+) -> None:
+    def scaled(match: re.Match[str]) -> str:
+        return f'{attribute}="{float(match[1]) * factor:.6f}"'
+
+    path = tmp_path / "fcd.xml"
+    path.write_text(re.sub(rf'{attribute}="([0-9.]+)"', scaled, of_sumo.read_text()))
+    with pytest.raises(DataError, match=says):
+        SumoFcdDataset(path=path, min_frames=50).load()
 
 
 def test_lengths_are_taken_as_the_docs_write_them(capsys: pytest.CaptureFixture[str]) -> None:
