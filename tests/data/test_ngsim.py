@@ -415,6 +415,23 @@ def test_a_file_in_two_units_is_refused(
             dataset.load()
 
 
+def test_two_recordings_in_one_file_without_a_clock_keep_their_lengths(
+    rows: pd.DataFrame, tmp_path: Path
+) -> None:
+    second = rows.assign(Frame_ID=rows["Frame_ID"] + 60, v_Length=25.0)
+    path = save(pd.concat([rows, second]).drop(columns="Global_Time"), tmp_path / "f.csv")
+    contents = NgsimDataset(path=path, min_frames=2).contents()
+    gaps = [round(float(pair.gap[0]) / FOOT, 6) for pair in contents.pairs]
+    assert dict(zip((pair.pair_id for pair in contents.pairs), gaps, strict=True)) == {
+        "f-2-1": 65.0,
+        "f-2-vehicle2-1-vehicle2": 55.0,
+        "f-3-2": 45.0,
+        "f-3-vehicle2-2-vehicle2": 35.0,
+    }
+    assert contents.vehicles == 6
+    assert "3 ids stand for two vehicles" in describe(path).text
+
+
 def test_a_preceding_that_is_not_the_next_in_the_lane_is_said(
     rows: pd.DataFrame, tmp_path: Path
 ) -> None:

@@ -26,7 +26,7 @@ from cfx.data.files import FileStart, Floats, Ints, stem
 from cfx.data.pairs import Dropped, PairSet
 from cfx.data.statements import Statement, remarks_of
 from cfx.data.table import Column, Labels, Layout, Table, read_table
-from cfx.data.tracks import Tracks, changes, extract_pairs, next_in_lane, rows_ahead
+from cfx.data.tracks import Tracks, changes, extract_pairs, next_in_lane, rows_ahead, vehicles_apart
 
 FOOT = 0.3048
 """Metres; exact by definition."""
@@ -68,6 +68,9 @@ _CLOCK, _LOCATION = "Global_Time", "Location"
 
 _HEADWAYS = ("Space_Headway", "Time_Headway")
 """Columns that follow from others: they are compared with these where they are there."""
+
+_BESIDES = (*_HEADWAYS, "v_Class")
+"""Columns that may be empty: by them no two rows of a vehicle at a frame are told apart."""
 
 _NO_TIME_HEADWAY = 9999.0
 """s; from here on `Time_Headway` says that the vehicle stands."""
@@ -135,6 +138,7 @@ _LAYOUT = Layout(
         _count("Preceding"),
         Column(_CLOCK, "ms", needed=False),
         Column(_LOCATION, is_name=True, needed=False),
+        Column("v_Class", needed=False, may_be_empty=True),
         Column("Space_Headway", "ft", needed=False, may_be_empty=True),
         Column("Time_Headway", "s", needed=False, may_be_empty=True),
     ),
@@ -234,7 +238,8 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     ordered = {name: values[order] for name, values in columns.items()}
     rows = _rows(str(path), names, places, recording[order], ordered, count, dropped)
     _check_units(rows)
-    return replace(rows, remarks=remarks_of(_said_twice(rows, ordered)))
+    rows = vehicles_apart(rows)
+    return replace(rows, remarks=(*rows.remarks, *remarks_of(_said_twice(rows, ordered))))
 
 
 def _said_twice(rows: Rows, columns: Mapping[str, Floats]) -> Iterator[Statement]:
@@ -281,7 +286,8 @@ def _rows(
         position=columns["Local_Y"] * FOOT,
         speed=columns["v_Vel"] * FOOT,
         acceleration=columns["v_Acc"] * FOOT,
-        length=_lengths(columns["v_Length"], recording, vehicle) * FOOT,
+        length=columns["v_Length"] * FOOT,
+        vehicle_class=_classes(columns),
         rows_read=count,
         sites=sites,
         dropped=tuple(dropped),
@@ -372,7 +378,7 @@ def _sorted(
     before, after = order[again - 1], order[again]
     differs = np.zeros(len(again), dtype=bool)
     for name, values in columns.items():
-        if name not in _HEADWAYS:
+        if name not in _BESIDES:
             differs |= values[before] != values[after]
     if differs.any():
         first, second = before[differs][0], after[differs][0]
@@ -387,11 +393,11 @@ def _sorted(
     return order[~is_same], len(again)
 
 
-def _lengths(length: Floats, recording: Ints, vehicle: Ints) -> Floats:
-    """Returns each vehicle's median length at each of its rows."""
-    group = np.cumsum(changes(recording, vehicle))
-    medians: Floats = pd.Series(length).groupby(group).transform("median").to_numpy()
-    return medians
+def _classes(columns: Mapping[str, Floats]) -> Ints | None:
+    """Returns the number of each row's vehicle class, 0 where the cell is empty; None if none."""
+    if "v_Class" not in columns:
+        return None
+    return np.nan_to_num(columns["v_Class"]).astype(np.int64)
 
 
 def _check_units(rows: Rows) -> None:

@@ -166,6 +166,7 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         gap=gap,
         driver_type=kind,
         driver_types=types,
+        ids_are_unique=True,
         names=("", *names.tolist()),
         dropped=(*rows.dropped, *counted(left_out, "rows")),
         remarks=remarks,
