@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from cfx import Dataset, PairSet, Settings
@@ -19,6 +21,7 @@ from cfx.data.files import FileStart, Floats, Ints, stem
 from cfx.data.pairs import Remark
 from cfx.data.statements import Statement, remarks_of
 from cfx.data.tracks import NOBODY, Marks, Tracks, counted, extract_pairs
+from cfx.data.whole import remarks_on_leaders
 from cfx_sumo.fcd_lanes import Couples, Lanes
 from cfx_sumo.fcd_rows import FcdRows, is_fcd, read_rows
 
@@ -26,6 +29,12 @@ log = logging.getLogger(__name__)
 
 _ROUNDING = 0.02
 """m and m/s: by how much two numbers that SUMO writes with two decimals may differ."""
+
+_MISSING = 0.05
+"""Share of the vehicles of flows whose numbers are left out, from which on it is said."""
+
+_LONGEST = 100
+"""A flow whose numbers go farther than so many times the vehicles that are recorded is none."""
 
 _LENGTH_IS_SUMOS = frozenset({"DEFAULT_VEHTYPE"})
 """vTypes that nobody declared: 5 m long, as SUMO says."""
@@ -150,7 +159,7 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         "driving against its lane's direction": is_oncoming,
         "parked beside the lane": is_parked,
     }
-    return Tracks(
+    tracks = Tracks(
         source=str(rows.path),
         dt=dt,
         recordings=(stem(rows.path),),
@@ -170,6 +179,38 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         names=("", *names.tolist()),
         dropped=(*rows.dropped, *counted(left_out, "rows")),
         remarks=remarks,
+    )
+    if gap is not None:
+        return tracks
+    return replace(tracks, remarks=(*_missing_of_flows(names), *remarks_on_leaders(tracks)))
+
+
+def _missing_of_flows(names: NDArray[np.str_]) -> tuple[Remark, ...]:
+    """Returns that vehicles of flows are not recorded: SUMO numbers them `NAME.0`, `NAME.1`, ..."""
+    flows: dict[str, list[int]] = {}
+    for name in names.tolist():
+        flow, _, number = name.rpartition(".")
+        if flow and number.isdecimal():
+            flows.setdefault(flow, []).append(int(number))
+    examples: list[str] = []
+    departed = recorded = 0
+    for flow, numbers in flows.items():
+        span = max(numbers) - min(numbers) + 1
+        if span > _LONGEST * len(numbers):
+            continue  # such numbers mean something else
+        departed += span
+        recorded += len(numbers)
+        for number in sorted(set(range(min(numbers), max(numbers))) - set(numbers)):
+            examples.append(f"{flow}.{number}")
+    if departed - recorded < max(1.0, _MISSING * departed):
+        return ()
+    return (
+        Remark(
+            f"{departed - recorded} of {departed} vehicles of flows are not in it"
+            f" ({listed(examples, 3)}): who drives behind one of them counts as following somebody"
+            " else; record all vehicles (no --device.fcd.probability), or let SUMO write leaders"
+            " (--fcd-output.max-leader-distance 200)"
+        ),
     )
 
 

@@ -15,6 +15,7 @@ import pytest
 
 from cfx.app.cli import main
 from cfx.core.errors import DataError
+from cfx.data.describe import describe
 from cfx_contracts import check_contract
 from cfx_sumo.fcd import SumoFcdDataset
 from cfx_sumo.fcd_lanes import Lanes
@@ -265,6 +266,8 @@ for net, routes, end, file, options in [
     ("n", "sublane", 40, "sublane-plain.xml", SUBLANE + PLAIN),
     ("two", "oncoming", 40, "oncoming.xml", []),
     ("two", "oncoming", 40, "oncoming-leaders.xml", LEADERS),
+    ("n", "r", 40, "some.xml", ["--device.fcd.probability", "0.4"]),
+    ("n", "r", 40, "some-leaders.xml", ["--device.fcd.probability", "0.4"] + LEADERS),
     ("n", "r", 20, "same.xml", []),
     ("n", "r", 20, "same.csv", []),
     ("n", "r", 20, "same.csv.gz", ["--output.column-header", "plain"]),
@@ -362,6 +365,19 @@ def test_oncoming_vehicles_are_no_pair(kinds: Path, name: str) -> None:
         assert rows[pair.leader_id, pair.first_frame]["lane"] in {"e1_0", "e2_0"}
         heads_back = ways == {"270.000000"}
         assert (rows[pair.follower_id, pair.first_frame]["lane"] == "e2_0") == heads_back
+
+
+def test_vehicles_that_are_not_recorded_are_said(kinds: Path, tmp_path: Path) -> None:
+    path = kinds / "some.xml"
+    text = describe(path).text
+    assert "vehicles of flows are not in it (" in text
+    assert "Problems: none found" not in text
+    for whole in ("some-leaders.xml", "same.xml"):
+        assert not SumoFcdDataset(path=kinds / whole, min_frames=2, lengths=LENGTHS).read().remarks
+    named = tmp_path / "named.xml"
+    named.write_text(re.sub(r'id="(.)\.', r'id="\1', path.read_text()))
+    remarks = SumoFcdDataset(path=named, min_frames=2, lengths=LENGTHS).read().remarks
+    assert not [remark for remark in remarks if "flows" in remark.text]
 
 
 @pytest.mark.parametrize("name", ["same.csv", "same.csv.gz", "same.parquet"])
