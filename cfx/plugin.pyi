@@ -43,6 +43,7 @@ from .data.files import (
     stem as stem,
 )
 from .data.pairs import Dropped as Dropped, Pair as Pair, PairBatch as PairBatch, PairSet as PairSet
+from .data.pairs import Remark as Remark
 from .data.signals import COARSE_S as COARSE_S
 from .data.sites import with_sites as with_sites
 from .data.style import (
@@ -76,7 +77,14 @@ from .data.tracks import (
     summed as summed,
     unique_name as unique_name,
 )
+from .data.tracks import (
+    next_in_lane as next_in_lane,
+    rows_ahead as rows_ahead,
+    vehicles_apart as vehicles_apart,
+)
 from .data.units import length_mm as length_mm
+from .data.statements import Statement as Statement, remarks_of as remarks_of
+from .data.whole import remarks_on_leaders as remarks_on_leaders
 
 # Models: states, steps, limits, regimes, what SUMO calls them
 from .models.base import (

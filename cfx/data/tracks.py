@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
-from typing import Any, Self
+from typing import Any, Self, TypeVar
 
 import numpy as np
+import pandas as pd
 from numpy.typing import NDArray
 
 from cfx.data.files import Floats, Ints
-from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.pairs import Dropped, Pair, PairSet, Remark
+from cfx.errors import listed
 
 Marks = NDArray[np.bool_]
 
@@ -18,6 +20,15 @@ NOBODY = 0
 """Stands where no vehicle is ahead."""
 
 SINGLE_FRAME = "a single frame makes no pair"
+
+_SAME_LENGTH_M = 0.3
+"""m: lengths of one vehicle differ by less."""
+
+_FASTEST_MPS, _PLACE_M = 70.0, 10.0
+"""No vehicle goes on faster than this, beside an error of its place; none goes back farther."""
+
+_LEAST_ROWS = 10
+"""Rows that tell a vehicle from a few wrong rows of another one."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -41,13 +52,16 @@ class Tracks:
             origin of its own.
         speed: m/s.
         acceleration: m/s2.
-        length: m, one value for each vehicle of a recording.
+        length: m, as recorded at each row.
         gap: bumper to bumper to the vehicle ahead, m, where the recording gives it; None: it
             follows from positions, and leaders must be in the follower's lane.
         driver_type: index into `driver_types`; None: the recording has no such labels.
         driver_types: labels.
+        vehicle_class: what kind of vehicle the source says it is; None: it does not.
+        ids_are_unique: no id stands for two vehicles, wherever and whenever it comes again.
         names: what vehicle number i is called, at index i; empty: by its number.
         dropped: what has been left out so far.
+        remarks: what was noticed about the source as a whole.
     """
 
     source: str
@@ -65,8 +79,11 @@ class Tracks:
     gap: Floats | None = None
     driver_type: Ints | None = None
     driver_types: tuple[str, ...] = ()
+    vehicle_class: Ints | None = None
+    ids_are_unique: bool = False
     names: tuple[str, ...] = ()
     dropped: tuple[Dropped, ...] = ()
+    remarks: tuple[Remark, ...] = ()
 
     def __len__(self) -> int:
         return len(self.vehicle)
@@ -98,6 +115,9 @@ class Tracks:
         return self.driver_types[int(self.driver_type[row])]
 
 
+_Tracks = TypeVar("_Tracks", bound=Tracks)
+
+
 def extract_pairs(tracks: Tracks, *, max_gap: float | None = None) -> PairSet:
     """Cuts tracks into leader-follower pairs.
 
@@ -108,9 +128,12 @@ def extract_pairs(tracks: Tracks, *, max_gap: float | None = None) -> PairSet:
     or counted once. `ends` counts why runs end: lane changes of either vehicle, cut-ins, missing
     rows. Runs of a single frame are no pairs.
 
+    An id that stands for two vehicles is taken for two (`vehicles_apart`).
+
     Args:
         max_gap: m; None: leaders may be anywhere ahead.
     """
+    tracks = vehicles_apart(tracks)
     facts = _Facts.of(tracks, max_gap)
     rows = np.flatnonzero(facts.is_following)
     follower = tracks.take(rows)
@@ -130,7 +153,108 @@ def extract_pairs(tracks: Tracks, *, max_gap: float | None = None) -> PairSet:
         tracks.source,
         (*tracks.dropped, *counted(reasons, "rows")),
         counted(_ends(tracks, facts, rows[starts + sizes - 1]), "pairs"),
+        tracks.remarks,
     )
+
+
+def vehicles_apart(tracks: _Tracks) -> _Tracks:
+    """Returns tracks in which an id that stands for two vehicles is two, each of one length.
+
+    Two recordings in one file use the same ids. An id goes over to another vehicle where its length
+    or class is another from then on, or where it is, in the same lane, farther back than before or
+    farther ahead than any vehicle drives in that time. A few wrong rows make no vehicle. The second
+    vehicle of an id is called `ID-vehicle2`. Lengths become each vehicle's median.
+    """
+    begins = changes(tracks.recording, tracks.vehicle)
+    is_again = np.zeros(len(tracks), dtype=bool)
+    if not tracks.ids_are_unique and len(tracks):
+        is_again[_changes_of_vehicle(tracks, begins)] = True
+    number = np.cumsum(begins | is_again, dtype=np.int64)
+    length = pd.Series(tracks.length).groupby(number).transform("median").to_numpy()
+    if not is_again.any():
+        return replace(tracks, length=length)
+    ahead, has_row = rows_ahead(tracks)
+    names, twice = _names_apart(tracks, begins, is_again)
+    nobody_known = len(names) - 1
+    somebody = np.where(tracks.leader == NOBODY, NOBODY, nobody_known)
+    remark = Remark(
+        f"{len(twice)} ids stand for two vehicles or more ({listed(twice, 5)}): their length, class"
+        " or way breaks off; each counts as a vehicle of its own. Are two recordings in one file?"
+    )
+    return replace(
+        tracks,
+        vehicle=number,
+        leader=np.where(has_row, number[ahead], somebody),
+        length=length,
+        names=names,
+        remarks=(*tracks.remarks, remark),
+    )
+
+
+def _changes_of_vehicle(tracks: Tracks, begins: Marks) -> Ints:
+    """Returns the rows at which an id goes over to another vehicle.
+
+    Args:
+        begins: whether a row is the first of its id, `(N,)`.
+    """
+    kind = tracks.vehicle_class
+    if kind is None:
+        kind = np.zeros(len(tracks), dtype=np.int64)
+    breaks = begins | (np.diff(tracks.frame, prepend=tracks.frame[:1]) != 1)
+    breaks |= np.abs(np.diff(tracks.length, prepend=tracks.length[:1])) > _SAME_LENGTH_M
+    breaks |= changes(kind)
+    rows = np.arange(len(tracks))
+    breaks |= _cannot_be_driven(tracks, np.maximum(rows - 1, 0), rows, np.ones(len(tracks)))
+    starts = np.flatnonzero(breaks)
+    last = np.append(starts[1:], len(tracks)) - 1
+    is_long = last - starts + 1 >= _LEAST_ROWS
+    starts, last = starts[is_long], last[is_long]
+    # Each stretch of rows is compared with the one before it, few wrong rows between left out.
+    before, start = last[:-1], starts[1:]
+    same_id = tracks.recording[before] == tracks.recording[start]
+    same_id &= tracks.vehicle[before] == tracks.vehicle[start]
+    stretch = np.cumsum(breaks)
+    medians = pd.Series(tracks.length).groupby(stretch).transform("median").to_numpy()
+    direction = np.sign(tracks.position[before] - tracks.position[starts[:-1]])
+    is_other = np.abs(medians[start] - medians[before]) > _SAME_LENGTH_M
+    is_other |= kind[start] != kind[before]
+    is_other |= _cannot_be_driven(tracks, before, start, np.where(direction < 0, -1.0, 1.0))
+    others: Ints = start[same_id & is_other]
+    return others
+
+
+def _cannot_be_driven(tracks: Tracks, before: Ints, after: Ints, direction: Floats) -> Marks:
+    """Returns whether no vehicle goes from one row to another in the same lane, `(M,)`.
+
+    Args:
+        direction: 1 where positions grow, -1 where they fall.
+    """
+    moved = (tracks.position[after] - tracks.position[before]) * direction
+    seconds = (tracks.frame[after] - tracks.frame[before]) * tracks.dt
+    is_impossible = (moved < -_PLACE_M) | (moved > _FASTEST_MPS * seconds + _PLACE_M)
+    if tracks.gap is not None:
+        # Positions are distances driven, each vehicle's from where its rows begin.
+        is_impossible[:] = False
+    impossible: Marks = is_impossible & (tracks.lane[after] == tracks.lane[before])
+    return impossible
+
+
+def _names_apart(
+    tracks: Tracks, begins: Marks, is_again: Marks
+) -> tuple[tuple[str, ...], list[str]]:
+    """Returns the vehicles' names by number, and the ids that stand for more than one.
+
+    Number 0 is nobody; the last one stands for whoever has no rows.
+    """
+    names, twice = [""], []
+    order = 1
+    for row in np.flatnonzero(begins | is_again).tolist():
+        name = tracks.name(int(tracks.vehicle[row]))
+        order = order + 1 if is_again[row] else 1
+        if order == 2:
+            twice.append(name)
+        names.append(f"{name}-vehicle{order}" if order > 1 else name)
+    return (*names, ""), twice
 
 
 def counted(reasons: Mapping[str, Marks], unit: str) -> tuple[Dropped, ...]:
@@ -191,7 +315,7 @@ class _Facts:
 
     @classmethod
     def of(cls, tracks: Tracks, max_gap: float | None) -> _Facts:
-        ahead, has_row = _rows_of(tracks, tracks.recording, tracks.leader, tracks.frame)
+        ahead, has_row = rows_ahead(tracks)
         if tracks.gap is None:
             in_lane = has_row & (tracks.lane[ahead] == tracks.lane)
             gap = tracks.position[ahead] - tracks.length[ahead] - tracks.position
@@ -227,6 +351,25 @@ class _Facts:
             "the leader is behind its follower (gap of 0 or less)": self.is_behind,
             f"the leader is farther than {self.max_gap:g} m": self.is_far,
         }
+
+
+def rows_ahead(tracks: Tracks) -> tuple[Ints, Marks]:
+    """Returns the row of each row's leader at that frame, 0 if none, and whether there is one."""
+    return _rows_of(tracks, tracks.recording, tracks.leader, tracks.frame)
+
+
+def next_in_lane(tracks: Tracks) -> tuple[Ints, Marks]:
+    """Returns the row of the next vehicle ahead in each row's lane, and whether there is one."""
+    ahead = np.zeros(len(tracks), dtype=np.int64)
+    has_row = np.zeros(len(tracks), dtype=bool)
+    order = np.lexsort((tracks.position, tracks.lane, tracks.frame, tracks.recording))
+    behind, front = order[:-1], order[1:]
+    same = tracks.recording[behind] == tracks.recording[front]
+    same &= tracks.frame[behind] == tracks.frame[front]
+    same &= tracks.lane[behind] == tracks.lane[front]
+    ahead[behind[same]] = front[same]
+    has_row[behind[same]] = True
+    return ahead, has_row
 
 
 def _rows_of(tracks: Tracks, recording: Ints, vehicle: Ints, frame: Ints) -> tuple[Ints, Marks]:

@@ -391,6 +391,61 @@ def test_boundary_artefacts_are_said_until_they_are_left_out(
     assert "data.trim" not in describe(straight).text
 
 
+@pytest.mark.parametrize(
+    ("in_metres", "says"),
+    [
+        ([], []),
+        (["Local_Y", "v_Vel", "v_Acc"], ["Space_Headway is typically 3.28", "Time_Headway"]),
+        (["v_Vel"], ["Time_Headway is typically 0.305 times"]),
+        (["Space_Headway"], ["Space_Headway is typically 0.305 times", "Time_Headway"]),
+    ],
+)
+def test_a_file_in_two_units_is_refused(
+    rows: pd.DataFrame, tmp_path: Path, in_metres: list[str], says: list[str]
+) -> None:
+    rows["Space_Headway"] = rows["Vehicle_ID"].map({1: 0.0, 2: 80.0, 3: 60.0})
+    rows["Time_Headway"] = (rows["Space_Headway"] / 30).replace(0.0, 9999.99)
+    rows[in_metres] *= FOOT
+    dataset = NgsimDataset(path=save(rows, tmp_path / "f.csv"), min_duration=0)
+    remarks = dataset.read().remarks
+    assert all(remark.is_contradiction for remark in remarks)
+    assert [words in remark.text for words, remark in zip(says, remarks, strict=True)] == [
+        True for _ in says
+    ]
+    if says:
+        with pytest.raises(DataError, match="feet and metres: is the file in two units"):
+            dataset.load()
+
+
+def test_two_recordings_in_one_file_without_a_clock_keep_their_lengths(
+    rows: pd.DataFrame, tmp_path: Path
+) -> None:
+    second = rows.assign(Frame_ID=rows["Frame_ID"] + 60, v_Length=25.0)
+    path = save(pd.concat([rows, second]).drop(columns="Global_Time"), tmp_path / "f.csv")
+    contents = NgsimDataset(path=path, min_duration=0).contents()
+    gaps = [round(float(pair.gap[0]) / FOOT, 6) for pair in contents.pairs]
+    assert dict(zip((pair.pair_id for pair in contents.pairs), gaps, strict=True)) == {
+        "f-2-1": 65.0,
+        "f-2-vehicle2-1-vehicle2": 55.0,
+        "f-3-2": 45.0,
+        "f-3-vehicle2-2-vehicle2": 35.0,
+    }
+    assert contents.vehicles == 6
+    assert "3 ids stand for two vehicles" in describe(path).text
+
+
+def test_a_preceding_that_is_not_the_next_in_the_lane_is_said(
+    rows: pd.DataFrame, tmp_path: Path
+) -> None:
+    rows.loc[rows["Vehicle_ID"] == 3, "Preceding"] = 1
+    alone = rows[rows["Frame_ID"] % 2 == 0].loc[lambda some: some["Vehicle_ID"] != 2]
+    between = rows[rows["Vehicle_ID"] == 2].assign(Preceding=0)
+    path = save(pd.concat([alone, between]), tmp_path / "f.csv")
+    (remark,) = NgsimDataset(path=path, min_duration=0).read().remarks
+    assert "the distance to the Preceding agrees with" in remark.text
+    assert not remark.is_contradiction
+
+
 # --- real recordings ------------------------------------------------------------------------------
 
 
@@ -406,6 +461,7 @@ def test_raw_sample_has_142_pairs(raw: PairSet) -> None:
     assert counts(raw)["the leader is behind its follower (gap of 0 or less)"] == 24
     assert {pair.recording for pair in raw} == {"i80_0400_raw_sample"}
     assert {pair.site for pair in raw} == {"i-80"}
+    assert not raw.remarks
 
 
 def test_raw_speeds_have_artefacts_for_three_seconds(shared_data: Path) -> None:

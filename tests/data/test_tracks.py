@@ -98,6 +98,50 @@ def test_types_of_drivers_are_kept() -> None:
     assert (pair.driver_type, pair.leader_driver_type) == ("acc", "human")
 
 
+SECOND = range(40, 60)
+"""Frames of a second recording."""
+
+TWICE = [
+    *AHEAD,
+    *driving(2, range(20), lane=2, leader=1, at=80.0),
+    *driving(1, SECOND, lane=2, leader=NONE, at=100.0),
+    *driving(2, SECOND, lane=2, leader=1, at=80.0),
+]
+"""Vehicle 2 behind vehicle 1, twice: they could have been hidden for two seconds."""
+
+
+@pytest.mark.parametrize("what", ["length", "vehicle_class", "position"])
+def test_an_id_whose_length_class_or_way_breaks_is_two_vehicles(what: str) -> None:
+    second = np.tile(np.arange(40) >= 20, 2)
+    values = {"length": 5.0 + 3.0 * second, "vehicle_class": 1 * second}
+    values["position"] = tracks_of(TWICE).position - 90.0 * second
+    pairs = extract_pairs(tracks_of(TWICE, **{what: values[what]}))
+    assert [pair.pair_id for pair in pairs] == ["r-2-1", "r-2-vehicle2-1-vehicle2"]
+    assert len({pair.driver for pair in pairs}) == 2
+    lengths = [5.0, 8.0 if what == "length" else 5.0]
+    assert [pair.leader_length for pair in pairs] == lengths
+    np.testing.assert_allclose(pairs[1].gap, 20.0 - lengths[1])
+    (remark,) = pairs.remarks
+    assert "2 ids stand for two vehicles or more (1, 2)" in remark.text
+
+
+def test_an_id_that_comes_again_as_it_was_is_one_vehicle() -> None:
+    pairs = extract_pairs(tracks_of(TWICE))
+    assert [pair.pair_id for pair in pairs] == ["r-2-1", "r-2-1-run2"]
+    assert not pairs.remarks
+    second = np.tile(np.arange(40) >= 20, 2)
+    again = tracks_of(TWICE, length=5.0 + 3.0 * second, ids_are_unique=True)
+    assert not extract_pairs(again).remarks
+
+
+def test_a_few_wrong_rows_make_no_other_vehicle() -> None:
+    length = np.full(80, 5.0)
+    length[[3, 50, 51]] = 9.0
+    pairs = extract_pairs(tracks_of(TWICE, length=length))
+    assert not pairs.remarks
+    assert {pair.leader_length for pair in pairs} == {5.0}
+
+
 def test_no_rows_make_no_pairs() -> None:
     pairs = extract_pairs(tracks_of([]))
     assert len(pairs) == 0

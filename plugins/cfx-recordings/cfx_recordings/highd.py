@@ -5,28 +5,32 @@ R. Krajewski, J. Bock, L. Kloeker and L. Eckstein (2018), The highD Dataset, IEE
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 import numpy as np
 from pydantic import Field
 
+from cfx.data.files import Floats, Ints
 from cfx.errors import DataError
 from cfx.plugin import (
     Dataset,
     FileColumn,
     FileDatasetSettings,
     FileStart,
-    Floats,
-    Ints,
     Layout,
     PairSet,
     Settings,
+    Statement,
     Table,
     Tracks,
     extract_pairs,
     joined,
     read_table,
+    remarks_of,
+    rows_ahead,
     with_sites,
 )
 
@@ -36,6 +40,12 @@ _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_rec
 def _count(name: str) -> FileColumn:
     return FileColumn(name, whole=True, least=0, wrong="is no whole number from 0 on")
 
+
+_TWICE = {"dhw": "m", "thw": "s", "ttc": "s", "precedingXVelocity": "m/s"}
+"""Columns that follow from others: they are compared with these where they are there."""
+
+_CLOSING_MPS = 0.2
+"""From this relative speed on, which has two decimals, a time to collision says something."""
 
 _TRACK_COLUMNS = Layout(
     "highD's tracks",
@@ -48,6 +58,7 @@ _TRACK_COLUMNS = Layout(
         FileColumn("xAcceleration", "m/s2"),
         _count("precedingId"),
         _count("laneId"),
+        *[FileColumn(name, unit, needed=False, may_be_empty=True) for name, unit in _TWICE.items()],
     ),
 )
 _VEHICLE_COLUMNS = Layout(
@@ -92,7 +103,7 @@ class HighdDataset(Dataset):
     to the left (1) is at `x`, and its position is `-x`; its speed and acceleration are `-xVelocity`
     and `-xAcceleration`.
 
-    **Labels.** `driver_type` and `leader_driver_type` are the vehicles' `class`: car or truck.
+    **NameColumn.** `driver_type` and `leader_driver_type` are the vehicles' `class`: car or truck.
 
     The recordings are called `highd-XX`, and sites `highd-location-N` by the `locationId` of the
     recording's metadata (six stretches of motorway). Vehicles are seen for some 14 s only, so pairs
@@ -155,7 +166,7 @@ def _tracks(path: Path, about: Table) -> Tracks:
     _check(table, speed)
     order = np.lexsort((numbers["frame"], numbers["id"]))
     front = np.where(to_right, numbers["x"] + numbers["width"], -numbers["x"])
-    return Tracks(
+    tracks = Tracks(
         source=str(path),
         dt=1.0 / float(about.numbers["frameRate"][0]),
         recordings=(f"highd-{path.name.removesuffix(_TRACKS)}",),
@@ -171,6 +182,30 @@ def _tracks(path: Path, about: Table) -> Tracks:
         driver_type=vehicles.kind[row_of][order],
         driver_types=vehicles.kinds,
     )
+    said = {name: numbers[name][order] for name in _TWICE if name in numbers}
+    return replace(tracks, remarks=remarks_of(_said_twice(tracks, said)))
+
+
+def _said_twice(tracks: Tracks, said: Mapping[str, Floats]) -> Iterator[Statement]:
+    """Yields what columns say that follows from others too; 0 stands where nobody is ahead."""
+    ahead, has_row = rows_ahead(tracks)
+    headway = np.where(has_row, tracks.position[ahead] - tracks.position, np.nan)
+    if "precedingXVelocity" in said:
+        speed = np.where(has_row, tracks.speed[ahead], np.nan)
+        leaders = np.abs(said["precedingXVelocity"])
+        yield Statement("precedingXVelocity", leaders, [speed], "the leader's xVelocity", 0.02)
+    if "dhw" not in said:
+        return
+    gap = headway - tracks.length[ahead]
+    yield Statement("dhw", said["dhw"], [headway, gap], "x and width of a vehicle and its leader")
+    moves = np.where(tracks.speed > 0, tracks.speed, np.nan)
+    if "thw" in said:
+        yield Statement("thw", said["thw"], [said["dhw"] / moves], "dhw and xVelocity", 0.02)
+    if "ttc" in said:
+        closing = np.abs(np.where(has_row, tracks.speed - tracks.speed[ahead], np.nan))
+        until = said["dhw"] / np.where(closing > _CLOSING_MPS, closing, np.nan)
+        basis = "dhw and xVelocity of a vehicle and its leader"
+        yield Statement("ttc", np.abs(said["ttc"]), [until], basis, 0.02)
 
 
 def _beside(path: Path, ending: str) -> Path:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import ClassVar
@@ -19,27 +19,30 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
+from cfx.data.files import Floats, Ints
+from cfx.data.pairs import Dropped, PairSet
 from cfx.errors import DataError, listed, nearest
 from cfx.plugin import (
     Contents,
     Dataset,
-    Dropped,
     FileColumn,
     FileDatasetSettings,
     FileStart,
-    Floats,
-    Ints,
     Layout,
     NameColumn,
-    PairSet,
     Settings,
+    Statement,
     Table,
     Tracks,
     changes,
     extract_pairs,
     joined,
+    next_in_lane,
     read_table,
+    remarks_of,
+    rows_ahead,
     stem,
+    vehicles_apart,
 )
 
 FOOT = 0.3048
@@ -80,6 +83,15 @@ MOTORWAY = (*_BEFORE_ZONES, *_AFTER_ZONES)
 _CLOCK, _LOCATION = "Global_Time", "Location"
 """Columns that are used where they are there."""
 
+_HEADWAYS = ("Space_Headway", "Time_Headway")
+"""Columns that follow from others: they are compared with these where they are there."""
+
+_BESIDES = (*_HEADWAYS, "v_Class")
+"""Columns that may be empty: by them no two rows of a vehicle at a frame are told apart."""
+
+_NO_TIME_HEADWAY = 9999.0
+"""s; from here on `Time_Headway` says that the vehicle stands."""
+
 _SPELLINGS = {
     "preceeding": "preceding",
     "precedingvehicle": "preceding",
@@ -87,6 +99,8 @@ _SPELLINGS = {
     "vehiclevelocity": "vvel",
     "acceleration": "vacc",
     "vehicleacceleration": "vacc",
+    "spacehdwy": "spaceheadway",
+    "timehdwy": "timeheadway",
     "length": "vlength",
     "vehiclelength": "vlength",
     "laneidentification": "laneid",
@@ -141,6 +155,9 @@ _LAYOUT = Layout(
         _count("Preceding"),
         FileColumn(_CLOCK, "ms", needed=False),
         FileColumn(_LOCATION, is_name=True, needed=False),
+        FileColumn("v_Class", needed=False, may_be_empty=True),
+        FileColumn("Space_Headway", "ft", needed=False, may_be_empty=True),
+        FileColumn("Time_Headway", "s", needed=False, may_be_empty=True),
     ),
     elsewhere={"pairid": "This is the tidy pair layout: use data=tidy."},
     headerless={18: MOTORWAY, 24: (*_BEFORE_ZONES, *_ZONES, *_AFTER_ZONES)},
@@ -238,7 +255,29 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     ordered = {name: values[order] for name, values in columns.items()}
     rows = _rows(str(path), names, places, recording[order], ordered, count, dropped)
     _check_units(rows)
-    return rows
+    rows = vehicles_apart(rows)
+    return replace(rows, remarks=(*rows.remarks, *remarks_of(_said_twice(rows, ordered))))
+
+
+def _said_twice(rows: Rows, columns: Mapping[str, Floats]) -> Iterator[Statement]:
+    """Yields what columns of a file say that follows from others too, in the file's units."""
+    ahead, has_row = rows_ahead(rows)
+    headway = np.where(has_row, rows.position[ahead] - rows.position, np.nan) / FOOT
+    # In the opposite direction of an arterial Local_Y decreases, and who is next is behind.
+    headway[headway < 0] = np.nan
+    following, is_there = next_in_lane(rows)
+    to_next = np.where(is_there, rows.position[following] - rows.position, np.nan) / FOOT
+    basis = "Local_Y and Lane_ID, by which another vehicle is the next ahead"
+    yield Statement("the distance to the Preceding", headway, [to_next], basis)
+    said = columns.get("Space_Headway")
+    if said is None:
+        return
+    yield Statement("Space_Headway", said, [headway], "Local_Y of a vehicle and its Preceding")
+    time_headway = columns.get("Time_Headway")
+    if time_headway is not None:
+        moves = (columns["v_Vel"] > 0) & (time_headway < _NO_TIME_HEADWAY)
+        speed = np.where(moves, columns["v_Vel"], np.nan)
+        yield Statement("Time_Headway", time_headway, [said / speed], "Space_Headway and v_Vel")
 
 
 def _rows(
@@ -264,7 +303,8 @@ def _rows(
         position=columns["Local_Y"] * FOOT,
         speed=columns["v_Vel"] * FOOT,
         acceleration=columns["v_Acc"] * FOOT,
-        length=_lengths(columns["v_Length"], recording, vehicle) * FOOT,
+        length=columns["v_Length"] * FOOT,
+        vehicle_class=_classes(columns),
         rows_read=count,
         sites=sites,
         dropped=tuple(dropped),
@@ -354,8 +394,9 @@ def _sorted(
     again = np.flatnonzero(is_same)
     before, after = order[again - 1], order[again]
     differs = np.zeros(len(again), dtype=bool)
-    for values in columns.values():
-        differs |= values[before] != values[after]
+    for name, values in columns.items():
+        if name not in _BESIDES:
+            differs |= values[before] != values[after]
     if differs.any():
         first, second = before[differs][0], after[differs][0]
         a, b = sorted((row[first], row[second]))
@@ -369,11 +410,11 @@ def _sorted(
     return order[~is_same], len(again)
 
 
-def _lengths(length: Floats, recording: Ints, vehicle: Ints) -> Floats:
-    """Returns each vehicle's median length at each of its rows."""
-    group = np.cumsum(changes(recording, vehicle))
-    medians: Floats = pd.Series(length).groupby(group).transform("median").to_numpy()
-    return medians
+def _classes(columns: Mapping[str, Floats]) -> Ints | None:
+    """Returns the number of each row's vehicle class, 0 where the cell is empty; None if none."""
+    if "v_Class" not in columns:
+        return None
+    return np.nan_to_num(columns["v_Class"]).astype(np.int64)
 
 
 def _check_units(rows: Rows) -> None:

@@ -17,6 +17,7 @@ from cfx.plugin import (
     Marks,
     Pair,
     PairSet,
+    Remark,
     accelerations,
     counted,
     driven,
@@ -69,6 +70,7 @@ def pairs_of(
     source: str,
     *,
     dropped: Sequence[Dropped] = (),
+    remarks: Sequence[Remark] = (),
     max_gap: float | None = None,
 ) -> PairSet:
     """Cuts series into pairs of consecutive frames without missing or impossible values.
@@ -77,6 +79,7 @@ def pairs_of(
     or the gap is 0 or less, or more than `max_gap`.
 
     Args:
+        remarks: what was noticed about the source as a whole.
         max_gap: m; None: leaders may be anywhere ahead.
     """
     pairs: list[Pair] = []
@@ -95,7 +98,7 @@ def pairs_of(
         ends += counted(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
         for start, stop in zip(starts[is_pair].tolist(), stops[is_pair].tolist(), strict=True):
             pairs.append(_pair(one, slice(good[start], good[stop - 1] + 1), seen))
-    return PairSet(tuple(pairs), source, summed(lost), summed(ends))
+    return PairSet(tuple(pairs), source, summed(lost), summed(ends), tuple(remarks))
 
 
 def _left_out(one: Series, max_gap: float | None) -> dict[str, Marks]:

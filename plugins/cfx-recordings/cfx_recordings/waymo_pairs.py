@@ -13,6 +13,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from cfx.data.files import Floats, Ints
 from cfx.errors import DataError
 from cfx.plugin import (
     Contents,
@@ -20,15 +21,15 @@ from cfx.plugin import (
     FileColumn,
     FileDatasetSettings,
     FileStart,
-    Floats,
-    Ints,
     Layout,
     PairSet,
     Settings,
+    Statement,
     Table,
     changes,
     joined,
     read_table,
+    remarks_of,
     stem,
 )
 from cfx_recordings.series import Series, frames_at, pairs_of
@@ -40,6 +41,9 @@ AUTOMATED = 0
 """Number of Waymo's own vehicle in every segment."""
 
 _TIME, _LENGTH = "local_time", "length"
+
+_OTHER_SPEEDS = ("position_based_speed", "speed_based_speed")
+"""Speeds of other estimates: they are compared with the one that is used, where they are there."""
 
 
 def _motion(name: str, earlier: str, unit: str) -> FileColumn:
@@ -58,6 +62,7 @@ _LAYOUT = Layout(
         _motion("filter_pos", "processed_position", "m"),
         _motion("filter_speed", "processed_speed", "m/s"),
         _motion("filter_accer", "processed_accer", "m/s2"),
+        *[FileColumn(name, "m/s", needed=False, may_be_empty=True) for name in _OTHER_SPEEDS],
     ),
 )
 
@@ -70,7 +75,7 @@ class WaymoPairsDataset(Dataset):
     vehicle's box along the path, so that the front bumper is half a `length` farther. Only times at
     which both vehicles have a row count.
 
-    **Labels.** Vehicle 0 is Waymo's: its type is automated, all others are human.
+    **NameColumn.** Vehicle 0 is Waymo's: its type is automated, all others are human.
 
     **Drivers.** `local_veh_id` counts anew in each segment, so a recording is a segment. Waymo's
     vehicle is vehicle 0 of every segment.
@@ -108,7 +113,13 @@ def _pairs(file: Table) -> PairSet:
         one = _series(file, {name: values[rows] for name, values in numbers.items()})
         if one is not None:
             series.append(one)
-    return pairs_of(series, file.source)
+    statements = []
+    for name in _OTHER_SPEEDS:
+        if name in numbers:
+            statements.append(
+                Statement(name, numbers[name], [numbers["filter_speed"]], "its speed")
+            )
+    return pairs_of(series, file.source, remarks=remarks_of(statements))
 
 
 def _series(file: Table, rows: Mapping[str, Floats]) -> Series | None:

@@ -132,6 +132,34 @@ def test_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> No
         assert words in text
 
 
+def test_columns_that_follow_from_others_agree_with_them(tmp_path: Path) -> None:
+    path = write_highd(tmp_path, made_pairs())
+    table = pd.read_csv(path)
+    ahead = table[["frame", "id", "x", "width", "xVelocity"]].rename(columns={"id": "precedingId"})
+    both = table.merge(ahead, on=["frame", "precedingId"], how="left", suffixes=("", "_ahead"))
+    front, front_ahead = both["x"] + both["width"], both["x_ahead"] + both["width_ahead"]
+    to_right = both["xVelocity"] > 0
+    headway = (front_ahead - front).where(to_right, both["x"] - both["x_ahead"])
+    closing = both["xVelocity"].abs() - both["xVelocity_ahead"].abs()
+    table["dhw"] = headway.fillna(0.0)
+    table["thw"] = (headway / both["xVelocity"].abs()).fillna(0.0)
+    table["ttc"] = (headway / closing).fillna(0.0)
+    table["precedingXVelocity"] = both["xVelocity_ahead"].fillna(0.0)
+    table.to_csv(path, index=False)
+    assert not HighdDataset(path=path, max_gap=None).read().remarks
+    for column, factor, units in (
+        ("dhw", 1 / 0.3048, "feet and metres"),
+        ("thw", 1000.0, "thousandths"),
+        ("ttc", 0.3048, "feet and metres"),
+        ("precedingXVelocity", 3.6, "km/h and m/s"),
+    ):
+        table.assign(**{column: table[column] * factor}).to_csv(path, index=False)
+        remarks = HighdDataset(path=path, max_gap=None).read().remarks
+        assert all(remark.is_contradiction for remark in remarks)
+        assert f"{column} is typically {factor:.3g} times" in remarks[0].text
+        assert units in remarks[0].text
+
+
 def broken(path: Path, column: str, value: object) -> None:
     table = pd.read_csv(path)
     table[column] = table[column].astype(object)

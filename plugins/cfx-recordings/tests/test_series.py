@@ -170,6 +170,17 @@ def test_gives_gaps_and_speeds_back(name: str, tmp_path: Path) -> None:
         assert pair.dt == 0.1
 
 
+def test_speeds_of_waymos_two_estimates_are_compared(tmp_path: Path) -> None:
+    path = waymo(tmp_path, made_pairs())
+    table = pd.read_csv(path)
+    for factor, says in ((1.02, []), (3.6, ["km/h and m/s"])):
+        table.assign(speed_based_speed=factor * table["filter_speed"]).to_csv(path, index=False)
+        remarks = WaymoPairsDataset(path=path).read().remarks
+        assert [words in remark.text for words, remark in zip(says, remarks, strict=True)] == [
+            True for _ in says
+        ]
+
+
 def test_each_is_recognised(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = [write(tmp_path, made_pairs()) for _, write in READERS.values()]
     assert main(["data", "describe", *map(str, files)]) == 0

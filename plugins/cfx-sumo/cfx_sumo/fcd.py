@@ -6,33 +6,47 @@ https://sumo.dlr.de/docs/Simulation/Output/FCDOutput.html
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from dataclasses import replace
 from typing import Annotated, ClassVar, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
+from cfx.data.files import Floats, Ints
 from cfx.errors import DataError, listed
 from cfx.plugin import (
     NOBODY,
     Dataset,
     FileDatasetSettings,
     FileStart,
-    Floats,
-    Ints,
     Marks,
     PairSet,
+    Remark,
     Settings,
+    Statement,
     Tracks,
     counted,
     extract_pairs,
     joined,
+    remarks_of,
+    remarks_on_leaders,
     stem,
 )
 from cfx_sumo.fcd_lanes import Couples, Lanes
 from cfx_sumo.fcd_rows import FcdRows, is_fcd, read_rows
 
 log = logging.getLogger(__name__)
+
+_ROUNDING = 0.02
+"""m and m/s: by how much two numbers that SUMO writes with two decimals may differ."""
+
+_MISSING = 0.05
+"""Share of the vehicles of flows whose numbers are left out, from which on it is said."""
+
+_LONGEST = 100
+"""A flow whose numbers go farther than so many times the vehicles that are recorded is none."""
 
 _LENGTH_IS_SUMOS = frozenset({"DEFAULT_VEHTYPE"})
 """vTypes that nobody declared: 5 m long, as SUMO says."""
@@ -139,12 +153,14 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
     length = np.array([lengths_of.get(name, settings.length) for name in types])[kind]
     position, number_of_lane = lanes.position, lanes.lane
     gap: Floats | None = None
+    remarks: tuple[Remark, ...] = ()
     if bool(np.isnan(rows.numbers["leaderGap"]).all()):
         _warn_of_lengths(rows, types, settings)
     else:
         known = {name: number + 1 for number, name in enumerate(names.tolist())}
         named = [known.get(name, NOBODY) for name in rows.texts["leaderID"][order].tolist()]
         by_name = _Ahead(np.array(named), numbers["leaderGap"][kept], length)
+        remarks = remarks_of(_said_twice(lanes, by_name, numbers["leaderSpeed"][kept], dt))
         leader, gap, length = _as_named(lanes, by_name, leader, beside)
         position = lanes.driven(dt)
         number_of_lane = lanes.lane_stints(edges)
@@ -152,7 +168,7 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         "driving against its lane's direction": is_oncoming,
         "parked beside the lane": is_parked,
     }
-    return Tracks(
+    tracks = Tracks(
         source=str(rows.path),
         dt=dt,
         recordings=(stem(rows.path),),
@@ -168,9 +184,66 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         gap=gap,
         driver_type=kind,
         driver_types=types,
+        ids_are_unique=True,
         names=("", *names.tolist()),
         dropped=(*rows.dropped, *counted(left_out, "rows")),
+        remarks=remarks,
     )
+    if gap is not None:
+        return tracks
+    return replace(tracks, remarks=(*_missing_of_flows(names), *remarks_on_leaders(tracks)))
+
+
+def _missing_of_flows(names: NDArray[np.str_]) -> tuple[Remark, ...]:
+    """Returns that vehicles of flows are not recorded: SUMO numbers them `NAME.0`, `NAME.1`, ..."""
+    flows: dict[str, list[int]] = {}
+    for name in names.tolist():
+        flow, _, number = name.rpartition(".")
+        if flow and number.isdecimal():
+            flows.setdefault(flow, []).append(int(number))
+    examples: list[str] = []
+    departed = recorded = 0
+    for flow, numbers in flows.items():
+        span = max(numbers) - min(numbers) + 1
+        if span > _LONGEST * len(numbers):
+            continue  # such numbers mean something else
+        departed += span
+        recorded += len(numbers)
+        for number in sorted(set(range(min(numbers), max(numbers))) - set(numbers)):
+            examples.append(f"{flow}.{number}")
+    if departed - recorded < max(1.0, _MISSING * departed):
+        return ()
+    return (
+        Remark(
+            f"{departed - recorded} of {departed} vehicles of flows are not in it"
+            f" ({listed(examples, 3)}): who drives behind one of them counts as following somebody"
+            " else; record all vehicles (no --device.fcd.probability), or let SUMO write leaders"
+            " (--fcd-output.max-leader-distance 200)"
+        ),
+    )
+
+
+def _said_twice(
+    lanes: Lanes, named: _Ahead, leader_speed: Floats, dt: float
+) -> Iterator[Statement]:
+    """Yields what SUMO says of leaders that follows from their own rows too."""
+    at, is_there = lanes.rows_of(named.leader)
+    speed = np.where(is_there, lanes.speed[at], np.nan)
+    yield Statement("leaderSpeed", leader_speed, [speed], "the leader's speed", _ROUNDING)
+    # Vehicles' lengths are not in the file, so changes are compared, over a second.
+    between = np.where(is_there, lanes.position[at] - lanes.position, np.nan)
+    later = max(1, round(1.0 / dt))
+    if len(between) <= later:
+        return
+    same = np.ones(len(between) - later, dtype=bool)
+    for key in (lanes.vehicle, named.leader, lanes.lane, lanes.lane[at]):
+        same &= key[later:] == key[:-later]
+    same &= (lanes.lane[at] == lanes.lane)[later:]
+    same &= lanes.frame[later:] - lanes.frame[:-later] == later
+    said = np.where(same, named.gap[later:] - named.gap[:-later], np.nan)
+    follows = np.where(same, between[later:] - between[:-later], np.nan)
+    basis = "pos of a vehicle and its leader"
+    yield Statement("the change of leaderGap", said, [follows], basis, 2 * _ROUNDING)
 
 
 def _types(rows: FcdRows) -> tuple[tuple[str, ...], Ints]:

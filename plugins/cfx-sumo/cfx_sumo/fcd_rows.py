@@ -32,7 +32,10 @@ from cfx.plugin import (
 _BLOCK = 1 << 20
 
 _NEEDED = ("id", "speed", "pos", "lane")
-_NUMBERS = ("speed", "pos", "acceleration", "leaderGap", "posLat", "x", "y", "angle")
+_NUMBERS = (
+    *("speed", "pos", "acceleration", "leaderGap", "leaderSpeed"),
+    *("posLat", "x", "y", "angle"),
+)
 _TEXTS = ("id", "lane", "type", "leaderID")
 
 _HOW = (
@@ -210,6 +213,7 @@ _LAYOUT = Layout(
         FileColumn("pos", "m", may_be_empty=True),
         FileColumn("acceleration", "m/s2", may_be_empty=True, needed=False),
         FileColumn("leaderGap", "m", may_be_empty=True, needed=False),
+        FileColumn("leaderSpeed", "m/s", may_be_empty=True, needed=False),
         FileColumn("posLat", "m", may_be_empty=True, needed=False),
         FileColumn("x", "m", may_be_empty=True, needed=False),
         FileColumn("y", "m", may_be_empty=True, needed=False),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import re
 import subprocess
 import sys
 import textwrap
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 from cfx.app.cli import main
+from cfx.data.describe import describe
 from cfx.errors import DataError
 from cfx_contracts import check_contract
 from cfx_sumo.fcd import SumoFcdDataset
@@ -118,6 +120,7 @@ def test_reads_what_sumo_writes(of_sumo: Path) -> None:
     assert len(pairs) > 5
     lengths = {pair.leader_driver_type: pair.leader_length for pair in pairs}
     assert lengths == {"car": 4.3, "truck": 12.0}, "lengths follow from gaps and positions"
+    assert not pairs.remarks
     for pair in pairs:
         moved = np.diff(pair.follower_position)
         # Gaps and speeds are SUMO's own; they belong together to the digits that it writes.
@@ -166,6 +169,25 @@ def test_leaders_are_those_that_sumo_names(
             np.testing.assert_allclose(pair.gap, other, atol=1e-4)
             matched += 1
     assert matched > len(by_name) / 2
+
+
+@pytest.mark.parametrize(
+    ("attribute", "factor", "says"),
+    [
+        ("leaderGap", 1 / 0.3048, "leaderGap is typically 3.28 times .* feet and metres"),
+        ("leaderSpeed", 3.6, r"leaderSpeed is typically 3\.6 times .* km/h and m/s"),
+    ],
+)
+def test_leaders_in_another_unit_are_refused(
+    of_sumo: Path, tmp_path: Path, attribute: str, factor: float, says: str
+) -> None:
+    def scaled(match: re.Match[str]) -> str:
+        return f'{attribute}="{float(match[1]) * factor:.6f}"'
+
+    path = tmp_path / "fcd.xml"
+    path.write_text(re.sub(rf'{attribute}="([0-9.]+)"', scaled, of_sumo.read_text()))
+    with pytest.raises(DataError, match=says):
+        SumoFcdDataset(path=path, min_duration=5).load()
 
 
 def test_lengths_are_taken_as_the_docs_write_them(capsys: pytest.CaptureFixture[str]) -> None:
@@ -244,6 +266,8 @@ for net, routes, end, file, options in [
     ("n", "sublane", 40, "sublane-plain.xml", SUBLANE + PLAIN),
     ("two", "oncoming", 40, "oncoming.xml", []),
     ("two", "oncoming", 40, "oncoming-leaders.xml", LEADERS),
+    ("n", "r", 40, "some.xml", ["--device.fcd.probability", "0.4"]),
+    ("n", "r", 40, "some-leaders.xml", ["--device.fcd.probability", "0.4"] + LEADERS),
     ("n", "r", 20, "same.xml", []),
     ("n", "r", 20, "same.csv", []),
     ("n", "r", 20, "same.csv.gz", ["--output.column-header", "plain"]),
@@ -341,6 +365,19 @@ def test_oncoming_vehicles_are_no_pair(kinds: Path, name: str) -> None:
         assert rows[pair.leader_id, pair.first_frame]["lane"] in {"e1_0", "e2_0"}
         heads_back = ways == {"270.000000"}
         assert (rows[pair.follower_id, pair.first_frame]["lane"] == "e2_0") == heads_back
+
+
+def test_vehicles_that_are_not_recorded_are_said(kinds: Path, tmp_path: Path) -> None:
+    path = kinds / "some.xml"
+    text = describe(path).text
+    assert "vehicles of flows are not in it (" in text
+    assert "Problems: none found" not in text
+    for whole in ("some-leaders.xml", "same.xml"):
+        assert not SumoFcdDataset(path=kinds / whole, min_duration=0, lengths=LENGTHS).read().remarks
+    named = tmp_path / "named.xml"
+    named.write_text(re.sub(r'id="(.)\.', r'id="\1', path.read_text()))
+    remarks = SumoFcdDataset(path=named, min_duration=0, lengths=LENGTHS).read().remarks
+    assert not [remark for remark in remarks if "flows" in remark.text]
 
 
 @pytest.mark.parametrize("name", ["same.csv", "same.csv.gz", "same.parquet"])
