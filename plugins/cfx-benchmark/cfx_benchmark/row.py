@@ -12,6 +12,7 @@ import pandas as pd
 
 from cfx.core.errors import DataError
 from cfx.core.files import write_json
+from cfx.data.names import names_of
 from cfx.evaluation.metrics.base import column_of
 from cfx.evaluation.statistics import mean_interval
 from cfx_benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash
@@ -99,7 +100,8 @@ def errors_of(job: Path, row: str, protocol: str, method: str) -> pd.DataFrame:
     columns = {metric: column_of(metric, SCOPE) for metric in METRICS}
     if table.empty or not set(columns.values()) <= set(table.columns):
         raise DataError(f"{job}: has no errors of '{method}' over full trajectories")
-    found = pd.DataFrame({"protocol": protocol, "row": row, "pair_id": table["pair_id"]})
+    names = names_of(table["pair_id"])
+    found = pd.DataFrame({"protocol": protocol, "row": row, "pair_id": names}, table.index)
     found["driver"] = table["driver"]
     for metric, column in columns.items():
         found[metric] = table[column].astype(float).round(_DIGITS)

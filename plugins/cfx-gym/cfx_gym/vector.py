@@ -23,6 +23,7 @@ from torch import Tensor
 import cfx
 from cfx import PairBatch, PairSet
 from cfx.core.errors import ConfigError, DataError
+from cfx.data.names import name_of
 from cfx.models.limits import LimitSettings, limited_speed
 from cfx.policies.agent import Agent
 from cfx.policies.driver_step import Motion
@@ -241,7 +242,7 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
 
     def _number(self, pair: object) -> int:
         for number, one in enumerate(self.pairs):
-            if one.pair_id == pair:
+            if one.pair_id == name_of(pair):
                 return number
         raise ConfigError(f"options: the recording has no pair '{pair}'")
 
