@@ -85,6 +85,7 @@ from .data.tracks import (
 from .data.units import length_mm as length_mm
 from .data.statements import Statement as Statement, remarks_of as remarks_of
 from .data.whole import remarks_on_leaders as remarks_on_leaders
+from .data.names import name_of as name_of, named_twice as named_twice, names_of as names_of
 
 # Models: states, steps, limits, regimes, what SUMO calls them
 from .models.base import (

@@ -20,6 +20,7 @@ from cfx.api.pairs import Pairs, read
 from cfx.app.job import steps
 from cfx.calibration.identifiability import losses_of
 from cfx.core.guest import visit
+from cfx.data.tidy import row_order
 from cfx.errors import DataError
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.simulation.windows import Split
@@ -100,13 +101,9 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         check_is_fitted(self)
         pairs = self._pairs(X)
         drive = simulate(self.model, self.parameters_, pairs, **(self.settings or {}))
-        frames = []
-        for pair in pairs.selected:
-            frames.append(pair.first_frame + np.arange(len(pair)))
-        index = pd.MultiIndex.from_arrays([drive["pair_id"], np.concatenate(frames)])
-        speed = pd.Series(drive["speed"].to_numpy(), index)
-        rows = pd.MultiIndex.from_arrays([X["pair_id"].astype(str), X["frame"].astype(int)])
-        return np.asarray(speed.reindex(rows), dtype=np.float64)
+        speed = np.empty(len(X))
+        speed[row_order(X)] = drive["speed"]
+        return speed
 
     def score(self, X: pd.DataFrame, y: object = None) -> float:  # noqa: N803 - as above
         """Returns minus the mean loss over the pairs, in the objective's unit: greater is better.

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from cfx.api.experiment import PolicyLike, config, in_folder, settings_of
-from cfx.api.pairs import PairsLike, pairs_from
+from cfx.api.pairs import PairIds, PairsLike, chosen_names, pairs_from
 from cfx.core.guest import visit
 from cfx.errors import ConfigError
 
@@ -53,7 +53,7 @@ class Forecast:
         found: pd.DataFrame = grouped.quantile(np.array(levels))
         return found.rename_axis(index=["pair_id", "time_s", "quantile"])
 
-    def plot(self, pair_ids: Sequence[str] | None = None) -> Figure:
+    def plot(self, pair_ids: PairIds | None = None) -> Figure:
         """Draws fans of paths and what happened; returns the figure.
 
         Args:
@@ -62,7 +62,8 @@ class Forecast:
         from cfx.api.figures import draw_fans
         from cfx.figures.figure import for_notebooks
 
-        chosen = list(self.paths["pair_id"].unique()[:3]) if pair_ids is None else list(pair_ids)
+        known = list(self.paths["pair_id"].unique())
+        chosen = known[:3] if pair_ids is None else chosen_names(pair_ids, known, "the forecast")
         return for_notebooks(draw_fans(chosen, self.quantiles(), self.measured))
 
     def __repr__(self) -> str:

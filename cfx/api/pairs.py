@@ -20,15 +20,41 @@ from cfx.core.guest import guest
 from cfx.core.storage import is_url
 from cfx.data.base import Dataset
 from cfx.data.describe import dataset_of
+from cfx.data.names import named_twice, names_of
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, TidySettings, frame_of, pairs_from_frame, write_tidy
-from cfx.errors import ConfigError, DataError
+from cfx.errors import ConfigError, DataError, nearest
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 PairsLike = Any
 """What `cfx.read` takes: `Pairs`, a `PairSet`, a data frame, or the path of a recording."""
+
+
+PairIds = str | float | Iterable[str | float]
+"""Ids of pairs, or one; 10, 10.0, "10" and " 10" are the same."""
+
+
+def chosen_names(pair_ids: PairIds, known: Sequence[str], source: str) -> list[str]:
+    """Returns the names of pairs that a caller chooses.
+
+    Args:
+        pair_ids: what they choose.
+        known: names of all pairs.
+        source: what messages call these.
+
+    Raises:
+        DataError: there is no pair of such a name, or one is named twice.
+    """
+    names = names_of(pair_ids)
+    for name in names:
+        if name not in known:
+            raise DataError(f"{source}: there is no pair '{name}'.{nearest(name, known)}")
+    twice = named_twice(names)
+    if twice is not None:
+        raise DataError(f"{source}: pair '{twice}' is named twice; name each pair once")
+    return names
 
 
 class FrameDataset(TidyDataset):
@@ -92,20 +118,18 @@ class Pairs:
         rows = [(one.reason, one.count, one.unit) for one in self.selected.dropped]
         return pd.DataFrame(rows, columns=["reason", "count", "unit"])
 
-    def select(self, pair_ids: Sequence[str]) -> Pairs:
+    def select(self, pair_ids: PairIds) -> Pairs:
         """Returns some of the pairs.
 
         Args:
-            pair_ids: their ids, or one.
+            pair_ids: their ids, or one, as text or as numbers.
 
         Raises:
-            DataError: there is no pair of such an id.
+            DataError: there is no pair of such an id, or one is named twice.
         """
-        wanted = {pair_ids} if isinstance(pair_ids, str) else set(pair_ids)
-        unknown = sorted(wanted - {pair.pair_id for pair in self.selected})
-        if unknown:
-            raise DataError(f"{self.selected.source}: there is no pair '{unknown[0]}'")
-        keep = [pair.pair_id in wanted for pair in self.selected]
+        known = [pair.pair_id for pair in self.selected]
+        chosen_ids = chosen_names(pair_ids, known, self.selected.source)
+        keep = [name in chosen_ids for name in known]
         chosen = self.selected.select(keep, "not selected")
         node = {**self.node, "pair_ids": [pair.pair_id for pair in chosen]}
         return replace(self, selected=chosen, node=node)
@@ -123,7 +147,7 @@ class Pairs:
         settings = {"data": "tidy", "data.path": absolute(path), "data.min_duration": 0}
         return Pairs.of(config_of({**settings, "data.accelerations": "recorded"}).data)
 
-    def plot(self, pair_ids: Sequence[str] | None = None) -> Figure:
+    def plot(self, pair_ids: PairIds | None = None) -> Figure:
         """Draws speeds and gap of some pairs over time; returns the figure.
 
         Args:

@@ -18,6 +18,7 @@ from cfx.api.pairs import PairsLike, pairs_from
 from cfx.app.overrides import config_of
 from cfx.core import registry
 from cfx.core.guest import visit
+from cfx.data.names import named_twice, names_of
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.data.table import FileColumn, Layout, table_of
 from cfx.data.tracks import accelerations, driven
@@ -147,7 +148,7 @@ def _recording(
             raise ConfigError("give pairs or leader, not both")
         names = ["follower"]
         if isinstance(parameters, pd.DataFrame):
-            names = [str(name) for name in parameters.index]
+            names = names_of(parameters.index)
         return _behind(leader, names, gap, speed)
     if gap is not None or speed is not None:
         raise ConfigError("gap and speed say where a follower of leader=... starts; give a leader")
@@ -215,7 +216,13 @@ def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict
     if isinstance(parameters, Fit):
         parameters = parameters.parameters
     if isinstance(parameters, pd.DataFrame):
-        table = parameters.set_axis(parameters.index.astype(str))
+        names = names_of(parameters.index)
+        twice = named_twice(names)
+        if twice is not None:
+            raise ConfigError(
+                f"parameters: two rows are of pair '{twice}'; give one row for each pair"
+            )
+        table = parameters.set_axis(names)
         missing = [name for name in ids if name not in table.index]
         if missing:
             raise ConfigError(

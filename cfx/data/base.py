@@ -20,6 +20,7 @@ from cfx.core.files import absolute
 from cfx.core.storage import is_url, local_copies
 from cfx.data.check import Check, check_pairs
 from cfx.data.files import FileStart, recording_of, stem
+from cfx.data.names import Name
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet, Remark
 from cfx.data.signals import Accelerations, resampled, scaled, with_usable_accelerations
 from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
@@ -77,7 +78,7 @@ class DatasetSettings(Settings):
         description="s: bring all pairs to this step, in which windows and policies count too;"
         " null: as recorded",
     )
-    recording: str | None = Field(None, description="keep this recording alone; null: all")
+    recording: Name | None = Field(None, description="keep this recording alone; null: all")
     site: SiteNames = Field(
         None,
         description="the road or area of the recordings: one name for all, or names by patterns of"
@@ -92,15 +93,15 @@ class DatasetSettings(Settings):
     lanes: Distinct[list[int] | None] = Field(
         None, description="keep pairs in these lanes alone; null: all"
     )
-    pair_ids: Distinct[list[str] | None] = Field(
+    pair_ids: Distinct[list[Name] | None] = Field(
         None, description="keep these pairs alone, by their ids; null: all"
     )
-    driver_type: str | None = Field(
+    driver_type: Name | None = Field(
         None,
         description="keep followers of this type alone, as the recording labels them: human, acc,"
         " automated, truck, a vType; null: all",
     )
-    leader_driver_type: str | None = Field(
+    leader_driver_type: Name | None = Field(
         None, description="keep pairs behind leaders of this type alone; null: all"
     )
     max_pairs: int | None = Field(None, ge=1, description="keep the first so many pairs; null: all")

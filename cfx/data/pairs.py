@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfx.core import memory
+from cfx.data.names import name_of
 from cfx.errors import DataError
 
 if TYPE_CHECKING:
@@ -92,6 +93,8 @@ class Pair:
     vehicle: str = ""
 
     def __post_init__(self) -> None:
+        for name in ("pair_id", "recording", "leader_id", "follower_id"):
+            object.__setattr__(self, name, name_of(getattr(self, name)))
         shapes = {name: getattr(self, name).shape for name in SIGNALS}
         if len(set(shapes.values())) != 1 or len(shapes["leader_position"]) != 1:
             raise DataError(

@@ -10,7 +10,6 @@ Rows are numbered as an editor shows them: the header is row 1 (blank lines are 
 
 from __future__ import annotations
 
-import contextlib
 import csv
 import io
 import re
@@ -28,6 +27,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from cfx.data.files import PARQUET, Floats, Ints, first_bytes, open_text, read_head, unpacking
+from cfx.data.names import name_of, names_of
 from cfx.errors import DataError, first_line, listed, nearest
 
 if TYPE_CHECKING:
@@ -328,6 +328,11 @@ def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
     names = [str(name) for name in frame.columns]
     found = layout.found_in(source, names)
     wanted = frame.set_axis(names, axis=1)[[names[one.at] for one in found.values()]]
+    for one in found.values():
+        cells = wanted[names[one.at]]
+        # Names may be numbers in some rows and text in others; Arrow wants one type.
+        if one.column.is_name and pd.api.types.infer_dtype(cells).startswith("mixed"):
+            wanted = wanted.assign(**{names[one.at]: names_of(cells)})
     try:
         columns = pa.Table.from_pandas(wanted, preserve_index=False)
     except pa.ArrowException as error:
@@ -459,18 +464,17 @@ def _labels(table: Table, name: str, column: Any) -> NameColumn:
             f"{table.source}{_first_broken(column)}, {where}: is no text in UTF-8; write the file"
             " again in UTF-8"
         ) from None
-    if pa.types.is_floating(column.type):  # 11.0, as pandas writes 11 beside a missing id
-        with contextlib.suppress(pa.ArrowInvalid):
-            column = column.cast(pa.int64())
+    if not (pa.types.is_dictionary(column.type) or pa.types.is_floating(column.type)):
+        column = column.cast(pa.string())
     if not pa.types.is_dictionary(column.type):
-        column = pc.dictionary_encode(column.cast(pa.string()))
+        column = pc.dictionary_encode(column)
     if isinstance(column, pa.ChunkedArray):
         column = column.unify_dictionaries().combine_chunks()
     if isinstance(column, pa.ChunkedArray):  # no chunk at all
         return NameColumn(np.zeros(0, np.int64), [])
     written: list[str | None] = []
     for one in column.dictionary.to_pylist():
-        written.append(str(one).strip() or None)
+        written.append(name_of(one) or None)
     merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
     codes = pc.fill_null(column.indices, len(written)).to_numpy(zero_copy_only=False)
     return NameColumn(np.append(merged, -1).astype(np.int64)[codes], list(names))

@@ -358,6 +358,19 @@ def pairs_from_frame(
     return _pairs(table_of(frame, layout, source))
 
 
+def row_order(frame: pd.DataFrame) -> Ints:
+    """Returns a table's rows `(N,)` in the order in which `pairs_from_frame` takes them.
+
+    That is pair by pair, as they first appear, and by time within each.
+
+    Raises:
+        DataError: as `pairs_from_frame`.
+    """
+    table = table_of(frame, LAYOUT, "table")
+    time = table.numbers.get("frame", table.numbers["time_s"])
+    return np.lexsort((time, table.labels["pair_id"].codes))
+
+
 def _pairs(table: Table) -> PairSet:
     table, order, starts = check(table)
     dropped: tuple[Dropped, ...] = ()

@@ -60,6 +60,16 @@ def test_speeds_are_predicted_in_the_order_of_the_rows(
     np.testing.assert_array_equal(predicted[first], table.loc[first, "follower_speed_mps"])
 
 
+def test_rows_are_matched_however_pairs_and_times_are_written(
+    fitted: CarFollowingRegressor, table: pd.DataFrame
+) -> None:
+    predicted = fitted.predict(table)
+    numbers = pd.Series(pd.factorize(table["pair_id"])[0], table.index)
+    for ids in (numbers.astype(float), numbers.astype(str) + " "):
+        again = table.assign(pair_id=ids).drop(columns="frame")
+        np.testing.assert_array_equal(fitted.predict(again), predicted)
+
+
 def test_its_score_is_the_loss_of_its_parameters(
     fitted: CarFollowingRegressor, table: pd.DataFrame
 ) -> None:

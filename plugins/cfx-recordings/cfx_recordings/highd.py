@@ -13,13 +13,14 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 from pydantic import Field
 
-from cfx.data.files import Floats, Ints
 from cfx.errors import DataError
 from cfx.plugin import (
     Dataset,
     FileColumn,
     FileDatasetSettings,
     FileStart,
+    Floats,
+    Ints,
     Layout,
     PairSet,
     Settings,

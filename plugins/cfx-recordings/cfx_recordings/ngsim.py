@@ -19,17 +19,19 @@ import numpy as np
 import pandas as pd
 from pydantic import Field
 
-from cfx.data.files import Floats, Ints
-from cfx.data.pairs import Dropped, PairSet
 from cfx.errors import DataError, listed, nearest
 from cfx.plugin import (
     Contents,
     Dataset,
+    Dropped,
     FileColumn,
     FileDatasetSettings,
     FileStart,
+    Floats,
+    Ints,
     Layout,
     NameColumn,
+    PairSet,
     Settings,
     Statement,
     Table,

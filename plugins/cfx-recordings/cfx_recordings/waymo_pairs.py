@@ -13,7 +13,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from cfx.data.files import Floats, Ints
 from cfx.errors import DataError
 from cfx.plugin import (
     Contents,
@@ -21,6 +20,8 @@ from cfx.plugin import (
     FileColumn,
     FileDatasetSettings,
     FileStart,
+    Floats,
+    Ints,
     Layout,
     PairSet,
     Settings,

@@ -14,13 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from cfx.data.files import Floats, Ints
 from cfx.errors import DataError, listed
 from cfx.plugin import (
     NOBODY,
     Dataset,
     FileDatasetSettings,
     FileStart,
+    Floats,
+    Ints,
     Marks,
     PairSet,
     Remark,

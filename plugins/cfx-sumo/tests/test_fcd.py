@@ -373,7 +373,9 @@ def test_vehicles_that_are_not_recorded_are_said(kinds: Path, tmp_path: Path) ->
     assert "vehicles of flows are not in it (" in text
     assert "Problems: none found" not in text
     for whole in ("some-leaders.xml", "same.xml"):
-        assert not SumoFcdDataset(path=kinds / whole, min_duration=0, lengths=LENGTHS).read().remarks
+        assert (
+            not SumoFcdDataset(path=kinds / whole, min_duration=0, lengths=LENGTHS).read().remarks
+        )
     named = tmp_path / "named.xml"
     named.write_text(re.sub(r'id="(.)\.', r'id="\1', path.read_text()))
     remarks = SumoFcdDataset(path=named, min_duration=0, lengths=LENGTHS).read().remarks

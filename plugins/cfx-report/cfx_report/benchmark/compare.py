@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from cfx.errors import DataError
-from cfx.plugin import Improvement, improvement_statistics
+from cfx.plugin import Improvement, improvement_statistics, named_twice, names_of
 from cfx_report.benchmark.row import COUNTS
 
 _NEEDED = ("row", "pair_id", "driver")
@@ -29,7 +29,7 @@ def read_errors(path: Path) -> pd.DataFrame:
             f"{path}: column {missing[0]} is missing; --against takes the benchmark_pairs.csv that"
             " cfx benchmark writes"
         )
-    return table
+    return table.assign(pair_id=names_of(table["pair_id"]))
 
 
 def compared(
@@ -54,8 +54,9 @@ def compared(
                 f"{source}, row '{name}': is of the protocol {', '.join(theirs)}, this is of"
                 f" {protocol}; errors of different protocols or pairs do not compare"
             )
-        if other["pair_id"].duplicated().any():
-            raise DataError(f"{source}, row '{name}': a pair stands in it twice")
+        twice = named_twice(other["pair_id"].tolist())
+        if twice is not None:
+            raise DataError(f"{source}, row '{name}': pair '{twice}' stands in it twice")
         both = mine.merge(other, on="pair_id", suffixes=("", "_other"))
         if len(both) < len(mine) or len(other) != len(mine):
             raise DataError(

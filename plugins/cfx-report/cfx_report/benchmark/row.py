@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from cfx.errors import DataError
-from cfx.plugin import column_of, mean_interval, write_json
+from cfx.plugin import column_of, mean_interval, names_of, write_json
 from cfx_report.benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash
 
 ROW, PAIRS = "benchmark.json", "benchmark_pairs.csv"
@@ -97,7 +97,8 @@ def errors_of(job: Path, row: str, protocol: str, method: str) -> pd.DataFrame:
     columns = {metric: column_of(metric, SCOPE) for metric in METRICS}
     if table.empty or not set(columns.values()) <= set(table.columns):
         raise DataError(f"{job}: has no errors of '{method}' over full trajectories")
-    found = pd.DataFrame({"protocol": protocol, "row": row, "pair_id": table["pair_id"]})
+    names = names_of(table["pair_id"])
+    found = pd.DataFrame({"protocol": protocol, "row": row, "pair_id": names}, table.index)
     found["driver"] = table["driver"]
     for metric, column in columns.items():
         found[metric] = table[column].astype(float).round(_DIGITS)
