@@ -271,7 +271,8 @@ class Dataset(Component):
             self.units(),
             can_say_units=hasattr(self.settings, "units"),
         )
-        kept = [pair.pair_id not in verdict.left_out for pair in selected.pairs]
+        left_out = frozenset(verdict.left_out)
+        kept = [pair.pair_id not in left_out for pair in selected.pairs]
         selected = selected.select(kept, verdict.reason)
         if isinstance(self.settings, FileDatasetSettings):
             selected = with_usable_accelerations(selected, self.settings.accelerations)

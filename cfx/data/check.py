@@ -78,8 +78,7 @@ def judge(pairs: PairSet, check: Check, units: Units | None = None) -> Verdict:
         sentences.append(_of_pairs(pairs, broken, units))
     can_leave_out = check == "drop" or (check == "drop_few" and _FEW * len(names) < len(pairs))
     if can_leave_out and not is_common:
-        rest = pairs.take([at for at, pair in enumerate(pairs.pairs) if pair.pair_id not in names])
-        typical = typical_contradiction(rest)
+        typical = typical_contradiction(_without(pairs, names))
     else:
         typical = None if broken else typical_contradiction(pairs)
     if typical is not None:
@@ -132,6 +131,12 @@ def check_pairs(
         for doubt in doubts(pairs):
             log.warning("%s: %s", pairs.source, doubt)
     return verdict
+
+
+def _without(pairs: PairSet, names: Sequence[str]) -> PairSet:
+    """Returns the pairs that are not named."""
+    left_out = frozenset(names)
+    return pairs.take([at for at, pair in enumerate(pairs.pairs) if pair.pair_id not in left_out])
 
 
 def _of_pairs(

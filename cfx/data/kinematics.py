@@ -582,6 +582,7 @@ def typical_contradiction(pairs: PairSet) -> Contradiction | None:
     """
     slopes: dict[tuple[str, str], list[float]] = {}
     left: dict[tuple[str, str], list[float]] = {}
+    missed: dict[tuple[str, str], list[float]] = {}
     for pair in pairs:
         relations = (*_relations(pair, "leader"), *_relations(pair, "follower"))
         for one in (*relations, _gap_relation(pair)):
@@ -593,8 +594,12 @@ def typical_contradiction(pairs: PairSet) -> Contradiction | None:
                 found, rule = one.measured(whole=True), _WHOLE
             if found.spread >= rule.spread and found.slope > 0:
                 slopes.setdefault(key, []).append(math.log(found.slope))
+                missed.setdefault(key, []).append(found.missed)
     for key, logs in slopes.items():
         median, room = _median(logs)
+        # Where a rate is smooth, what its integral misses goes with the signal and changes the
+        # slope: accelerations that are differences of speeds over two steps of 1 s make it 1.06.
+        room += float(np.median(missed[key]))
         if len(logs) >= _FEW_PAIRS and abs(median) > _TYPICAL + room:
             return Contradiction(*key, math.exp(median), "", 1.0)
     for key, shares in left.items():

@@ -102,7 +102,7 @@ def _remark_of(statement: Statement) -> Remark | None:
             if is_unit and one.steady >= _MOST:
                 return Remark(
                     f"{statement.column} is typically {one.factor:.3g} times what follows from"
-                    f" {statement.basis}, as between {units}: is the file in two units?",
+                    f" {statement.basis}, as between {units}: the file seems to be in two units",
                     is_contradiction=True,
                 )
     closest = max(comparisons, key=lambda one: one.agree)

@@ -151,6 +151,24 @@ def test_noise_between_coarse_frames_is_not_held_against_a_signal() -> None:
     assert "sign is turned" in wrong.text()
 
 
+def test_differences_of_coarse_speeds_do_not_contradict_them() -> None:
+    """Of many pairs alike, in each of which speeds change 6 % more than their differences say."""
+    time = np.arange(200.0)
+    (pair,) = straight_pairs([200]).pairs
+    pairs = []
+    for number in range(10):
+        signals = {}
+        for who, ahead in (("leader", 40.0), ("follower", 0.0)):
+            speed = 12.0 + 2.0 * np.sin(0.5 * time + number)
+            signals[f"{who}_speed"] = speed
+            signals[f"{who}_acceleration"] = np.gradient(speed)
+            signals[f"{who}_position"] = ahead + driven(speed, 1.0)
+        pairs.append(replace(pair, pair_id=f"p{number}", dt=1.0, **signals))
+    assert typical_contradiction(PairSet(tuple(pairs), "made up")) is None
+    wrong = [times(1.2, *ACCELERATIONS, pair=pair) for pair in pairs]
+    assert typical_contradiction(PairSet(tuple(wrong), "made up")) is not None
+
+
 def test_a_stationary_pair_says_nothing_and_is_let_through() -> None:
     still = replace(
         times(0.0, *SPEEDS, *ACCELERATIONS),

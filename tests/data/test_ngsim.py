@@ -413,7 +413,7 @@ def test_a_file_in_two_units_is_refused(
         True for _ in says
     ]
     if says:
-        with pytest.raises(DataError, match="feet and metres: is the file in two units"):
+        with pytest.raises(DataError, match="feet and metres: the file seems to be in two units"):
             dataset.load()
 
 

@@ -26,15 +26,6 @@ def dataset(name: str, **settings: object) -> cfx.plugin.PairSet:
     return made.load()
 
 
-@pytest.fixture
-def recordings() -> Path:
-    """The real recordings beside the checkout; skips where they are absent."""
-    folder = Path(__file__).resolve().parents[4] / "shared" / "data"
-    if not folder.is_dir():
-        pytest.skip(f"real recordings are not here ({folder})")
-    return folder
-
-
 def test_the_protocol_is_the_published_one() -> None:
     assert protocol_hash() == "62d886338f53", (
         "rows of docs/benchmark.md are of this protocol: another one needs another VERSION, and"
@@ -42,8 +33,8 @@ def test_the_protocol_is_the_published_one() -> None:
     )
 
 
-def test_the_frozen_pairs_are_those_of_the_recordings(recordings: Path) -> None:
-    path = recordings / "i80_reconstructed_pairs.parquet"
+def test_the_frozen_pairs_are_those_of_the_recordings(shared_data: Path) -> None:
+    path = shared_data / "i80_reconstructed_pairs.parquet"
     pairs = dataset("tidy", path=path, min_duration=30)
     assert pairs.fingerprint == DATA
     assert sum(len(pair) >= 700 for pair in pairs) == TESTED
