@@ -920,20 +920,8 @@ class Driver:
             self._leaders.pop(name, None)
         self._begin(new, beginning)
         store.free[new] = True
-        store.parameters[new] = self._free_parameters(new)
-
-    def _free_parameters(self, slots: Tensor) -> Tensor:
-        """Returns the parameters of vehicles without a leader, `(D, n)`, SI units.
-
-        The policy has not learned to choose any. They are those to which it fades outside what it
-        has learned: its base or its pooled parameters; or else the model's defaults.
-        """
-        policy, network = self.policy, self._store.network[slots]
-        if policy.base is not None:
-            return self._store.base[slots]
-        if policy.population is not None:
-            return policy.head.completed(policy.population[network].double())
-        return policy.space.defaults().double().expand(len(slots), -1)
+        base = None if self.policy.base is None else store.base[new]
+        store.parameters[new] = self.policy.free_road_parameters(store.network[new], base)
 
     def _begun(self, slots: Tensor) -> AgentState:
         """Returns the state of vehicles before their first window."""
