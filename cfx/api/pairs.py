@@ -17,7 +17,6 @@ from cfx.core import registry
 from cfx.core.component import validate
 from cfx.core.errors import ConfigError, DataError, nearest
 from cfx.core.files import absolute
-from cfx.core.guest import guest
 from cfx.core.storage import is_url
 from cfx.data.base import Dataset
 from cfx.data.describe import dataset_of
@@ -185,7 +184,6 @@ class Pairs:
         return as_html(repr(self), self.summary)
 
 
-@guest()
 def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> Pairs:
     """Reads leader-follower pairs, as `data=DATASET data.path=SOURCE` on the command line.
 
