@@ -17,7 +17,7 @@ import yaml
 from cfx.app.overrides import command_of
 from cfx.core import registry
 from cfx.core.files import atomic_write, remove_leftovers, write_json
-from cfx.core.guest import visit
+from cfx.core.guest import default_torch, guest, in_turn, visit
 from cfx.core.job_folder import examine, parse_yaml, read_metrics
 from cfx.core.storage import RemoteFolder
 from cfx.data.style import StyleResult
@@ -423,7 +423,7 @@ class JobResult:
         if self.computed is None:
             raise DataError(f"this job was read from {self.folder}; copy that folder")
         config, parts, findings = vars(self.computed).values()
-        with visit():
+        with in_turn(), guest(), default_torch():
             begin(Path(folder), config)
             kept = write_job(Path(folder), config, parts, findings)
         return replace(self, folder=Path(folder), figures=tuple(kept.figures))
