@@ -34,6 +34,7 @@ from cfx.results.provenance import commit, version
 from cfx.results.table import (
     Findings,
     Kept,
+    ResultTable,
     WrittenTable,
     file_of,
     installed,
@@ -97,7 +98,7 @@ def write_job(
     with _writing(folder):
         (folder / METRICS).unlink(missing_ok=True)
         _write_config(folder, config)
-        tables = tables_of(findings, folder)
+        tables = tables_of(findings, parts.tables, folder)
         if any(pair.truth for pair in findings.pairs):
             with atomic_write(folder / "data.parquet") as temporary:
                 write_tidy(findings.pairs, temporary)
@@ -141,8 +142,12 @@ def _write_config(folder: Path, config: JobConfig) -> None:
         temporary.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
 
 
-def tables_of(findings: Findings, folder: Path | None = None) -> list[WrittenTable]:
-    """Returns the tables of the results; of those that are large the rows are left out.
+def tables_of(
+    findings: Findings,
+    chosen: Sequence[registry.Installed[ResultTable]],
+    folder: Path | None = None,
+) -> list[WrittenTable]:
+    """Returns the chosen tables of the results; of those that are large the rows are left out.
 
     Those that an earlier job left in the folder go, if one is given; these are written there.
 
@@ -151,7 +156,7 @@ def tables_of(findings: Findings, folder: Path | None = None) -> list[WrittenTab
     """
     tables = []
     for about in installed():
-        parts = parts_of(about, findings)
+        parts = parts_of(about, findings) if about in chosen else None
         path = None if folder is None else folder / file_of(about)
         if parts is None:
             if path is not None:
@@ -405,7 +410,8 @@ class JobResult:
             assert self.folder is not None
             return read_job(Origin(str(self.folder), self.folder)).results
         findings = self.computed.findings
-        return results_of(findings, tables_of(findings), self.metrics)
+        tables = tables_of(findings, self.computed.parts.tables)
+        return results_of(findings, tables, self.metrics)
 
     def save(self, folder: str | Path) -> JobResult:
         """Writes the job's folder, as a job of the command line does; MLflow is not told.
