@@ -116,7 +116,10 @@ def test_the_page_of_the_door_is_made_from_it() -> None:
     assert spec.loader is not None
     door = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(door)
-    assert door.PAGE.read_text(encoding="utf-8") == door.text(), "make conf"
+    page = door.text()
+    assert door.PAGE.read_text(encoding="utf-8") == page, "make conf"
+    assert not re.findall(r"^\| `(\w+)` \|\s+\|$", page, flags=re.MULTILINE), "no meaning"
+    assert "ndarray(shape" not in page  # a constant is not documented by the class of its value
 
 
 def test_every_public_name_is_in_the_reference() -> None:

@@ -60,6 +60,7 @@ NOISE_SCALE = Parameter(
     "standard deviation of the residual acceleration",
     "Zhang and Sun (2024) find about 0.2 for drivers of highD",
 )
+"""The parameter that scales a sampled driver's noise on the acceleration, m/s2."""
 PARAMETER_TIME = Parameter(
     "parameter_time",
     "s",
