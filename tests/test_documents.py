@@ -32,6 +32,8 @@ PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rgl
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", *PAGES]
 GUIDES = {"docs/plugins.md", "docs/how-to/own-model.md"}
 """Their commands need packages that they write before."""
+NOT_IN_SEARCH = "---\nsearch:\n  exclude: true\n---\n\n"
+"""What a page begins with that the site's search leaves out."""
 
 
 def printed(language: str) -> Iterator[str]:
@@ -181,11 +183,13 @@ def test_every_decision_is_in_the_index_and_has_its_three_parts() -> None:
     folder = ROOT / "docs" / "decisions"
     index = (folder / "README.md").read_text(encoding="utf-8")
     records = sorted(folder.glob("[0-9]*.md"))
+    assert len(records) <= 25, "what concerns one place is a comment there"
+    assert index.startswith(NOT_IN_SEARCH)
     for number, path in enumerate(records, start=1):
         assert path.name.startswith(f"{number:04d}-")
         assert f"]({path.name})" in index
         text = path.read_text(encoding="utf-8")
-        assert text.startswith(f"# {number}. ")
+        assert text.startswith(f"{NOT_IN_SEARCH}# {number}. ")
         for part in ("Context", "Decision", "Consequence"):
             assert f"\n**{part}.** " in text, f"{path.name}: {part}"
 
