@@ -294,6 +294,20 @@ def test_the_map_has_every_room_on_the_floor_that_the_test_of_imports_has() -> N
             assert path.name in area, path.name
 
 
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")), ids=lambda path: path.stem
+)
+def test_the_forms_of_issues_are_complete(path: Path) -> None:
+    form = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert {"name", "description", "body"} <= set(form)
+    names = [part["id"] for part in form["body"]]
+    assert len(set(names)) == len(names)
+    for part in form["body"]:
+        assert part["type"] in {"input", "textarea", "dropdown"}
+        assert {"label", "description"} <= set(part["attributes"])
+        assert ("options" in part["attributes"]) == (part["type"] == "dropdown")
+
+
 def guide() -> list[tuple[str, str]]:
     """Returns the shell and Python blocks of the guide, in order."""
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
