@@ -45,25 +45,30 @@ def text() -> str:
 
 
 def first_sentence(module: str, name: str) -> str:
-    """Returns the first sentence of a name's docstring; of a constant, of the text below it."""
-    value = getattr(import_module(module), name)
-    if callable(value) and hasattr(value, "__module__"):
-        documented = inspect.getdoc(value) or ""
-    else:
-        documented = constants(module).get(name, "")
+    """Returns the first sentence about a name.
+
+    Of a constant or a name for a type it is in the text below its assignment, because the
+    docstring of the value is that of its class; of everything else it is in the docstring.
+    """
+    documented = texts_below_assignments(module).get(name)
+    if documented is None:
+        documented = inspect.getdoc(getattr(import_module(module), name)) or ""
     return documented.partition("\n\n")[0]
 
 
-def constants(module: str) -> dict[str, str]:
-    """Returns the texts that stand below the assignments of a module, by the names assigned."""
+def texts_below_assignments(module: str) -> dict[str, str]:
+    """Returns the text below each assignment of a module, "" if there is none, by name."""
     body = ast.parse(inspect.getsource(import_module(module))).body
     texts = {}
-    for node, below in itertools.pairwise(body):
-        is_text = isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant)
-        if isinstance(node, ast.Assign | ast.AnnAssign) and is_text:
-            for name in ast.walk(node):
-                if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store):
-                    texts[name.id] = inspect.cleandoc(str(below.value.value))
+    for node, below in itertools.pairwise([*body, ast.Pass()]):
+        if not isinstance(node, ast.Assign | ast.AnnAssign):
+            continue
+        text_below = ""
+        if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
+            text_below = inspect.cleandoc(str(below.value.value))
+        for name in ast.walk(node):
+            if isinstance(name, ast.Name) and isinstance(name.ctx, ast.Store):
+                texts[name.id] = text_below
     return texts
 
 

@@ -32,6 +32,8 @@ PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rgl
 DOCUMENTS = ["README.md", "CONTRIBUTING.md", *PAGES]
 GUIDES = {"docs/plugins.md", "docs/how-to/own-model.md"}
 """Their commands need packages that they write before."""
+NOT_IN_SEARCH = "---\nsearch:\n  exclude: true\n---\n\n"
+"""What a page begins with that the site's search leaves out."""
 
 
 def printed(language: str) -> Iterator[str]:
@@ -95,8 +97,9 @@ def test_there_are_commands_to_check() -> None:
     assert {call.split()[3] for call in of_sub_commands()} == first
 
 
-def test_the_readme_is_short() -> None:
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 900
+@pytest.mark.parametrize(("name", "words"), [("README.md", 900), ("CONTRIBUTING.md", 800)])
+def test_what_is_read_first_is_short(name: str, words: int) -> None:
+    assert len((ROOT / name).read_text(encoding="utf-8").split()) <= words
 
 
 def test_the_site_names_pages_that_exist() -> None:
@@ -116,7 +119,10 @@ def test_the_page_of_the_door_is_made_from_it() -> None:
     assert spec.loader is not None
     door = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(door)
-    assert door.PAGE.read_text(encoding="utf-8") == door.text(), "make conf"
+    page = door.text()
+    assert door.PAGE.read_text(encoding="utf-8") == page, "make conf"
+    assert not re.findall(r"^\| `(\w+)` \|\s+\|$", page, flags=re.MULTILINE), "no meaning"
+    assert "ndarray(shape" not in page  # a constant is not documented by the class of its value
 
 
 def test_every_public_name_is_in_the_reference() -> None:
@@ -178,11 +184,13 @@ def test_every_decision_is_in_the_index_and_has_its_three_parts() -> None:
     folder = ROOT / "docs" / "decisions"
     index = (folder / "README.md").read_text(encoding="utf-8")
     records = sorted(folder.glob("[0-9]*.md"))
+    assert len(records) <= 25, "what concerns one place is a comment there"
+    assert index.startswith(NOT_IN_SEARCH)
     for number, path in enumerate(records, start=1):
         assert path.name.startswith(f"{number:04d}-")
         assert f"]({path.name})" in index
         text = path.read_text(encoding="utf-8")
-        assert text.startswith(f"# {number}. ")
+        assert text.startswith(f"{NOT_IN_SEARCH}# {number}. ")
         for part in ("Context", "Decision", "Consequence"):
             assert f"\n**{part}.** " in text, f"{path.name}: {part}"
 
@@ -267,24 +275,37 @@ def test_the_table_of_kinds_names_what_is_there() -> None:
     assert int(declared) == cfx.plugin.API_VERSION
 
 
-def test_the_map_names_every_room() -> None:
+def test_the_map_has_every_room_on_the_floor_that_the_test_of_imports_has() -> None:
     text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
     area = text.partition("\ncfx/\n")[2].partition("\nconf/ ")[0]
+    mapped: dict[int, list[str]] = {}
+    for line in area.splitlines():
+        row = re.fullmatch(r" +(\d+) {2}((\w+)(?:/|\.pyi?)) +\S.*", line)
+        assert row is not None, line
+        height, path, room = row.groups()
+        assert (ROOT / "cfx" / path).exists(), f"{path} is not there any more"
+        mapped.setdefault(int(height), []).append(room)
+    assert list(mapped) == sorted(mapped, reverse=True)
+    assert mapped == {height: list(floor) for height, floor in enumerate(FLOORS, start=1)}
     for path in (ROOT / "cfx").iterdir():
         if path.is_dir() and path.name not in {"__pycache__", "conf"}:
             assert f"  {path.name}/ " in area, path.name
         elif path.suffix == ".py" and not path.name.startswith("__"):
             assert path.name in area, path.name
-    for room in re.findall(r"^  (\w+)/", area, flags=re.MULTILINE):
-        assert (ROOT / "cfx" / room).is_dir(), f"{room} is not there any more"
 
 
-def test_the_floors_are_those_of_the_test_of_imports() -> None:
-    text = (ROOT / "CONTRIBUTING.md").read_text(encoding="utf-8")
-    rows = re.findall(r"^ ?(\d+) {3,}(\w+(?: {2,20}\w+)?) {3,}\S", text, flags=re.MULTILINE)
-    assert [(int(height), tuple(rooms.split())) for height, rooms in rows] == [
-        (height, FLOORS[height - 1]) for height in range(len(FLOORS), 0, -1)
-    ]
+@pytest.mark.parametrize(
+    "path", sorted((ROOT / ".github" / "ISSUE_TEMPLATE").glob("*.yml")), ids=lambda path: path.stem
+)
+def test_the_forms_of_issues_are_complete(path: Path) -> None:
+    form = yaml.safe_load(path.read_text(encoding="utf-8"))
+    assert {"name", "description", "body"} <= set(form)
+    names = [part["id"] for part in form["body"]]
+    assert len(set(names)) == len(names)
+    for part in form["body"]:
+        assert part["type"] in {"input", "textarea", "dropdown"}
+        assert {"label", "description"} <= set(part["attributes"])
+        assert ("options" in part["attributes"]) == (part["type"] == "dropdown")
 
 
 def guide() -> list[tuple[str, str]]:

@@ -226,6 +226,8 @@ class Calibrator:
     def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
         """Finds the parameters of each window; ties go to the driver-specific parameters.
 
+        Not to the pooled ones: labels would depend on the fold and be calibrated once for each.
+
         Args:
             pairs: P pairs.
             batch: the same as tensors.

@@ -14,7 +14,10 @@ from typing import ClassVar, TypeVar
 from cfx.core.component import Component
 
 ShardT = TypeVar("ShardT")
+"""What a shard of the work is."""
+
 ResultT = TypeVar("ResultT")
+"""What the work on a shard gives."""
 
 Report = Callable[[int], None]
 """Called with how many more units of work are done."""

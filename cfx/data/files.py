@@ -26,7 +26,10 @@ from numpy.typing import NDArray
 from cfx.errors import DataError, listed, nearest
 
 Floats = NDArray[np.float64]
+"""Signals and other real values of a file, of any shape."""
+
 Ints = NDArray[np.int64]
+"""Row numbers, frames, codes and counts, of any shape."""
 
 _GZIP = b"\x1f\x8b"
 _ZIP = b"PK\x03\x04"

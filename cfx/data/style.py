@@ -54,6 +54,7 @@ INDICATORS = (
     Indicator("mean_space_headway", -1, "m"),
     Indicator("mean_time_headway", -1, "s"),
 )
+"""What a driver's style is scored by: columns of the evaluation matrix, in their order."""
 
 
 def name_of_indicator(name: str) -> str:

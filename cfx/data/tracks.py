@@ -15,11 +15,13 @@ from cfx.data.pairs import Dropped, Pair, PairSet, Remark
 from cfx.errors import listed
 
 Marks = NDArray[np.bool_]
+"""Says of each row whether something holds, `(N,)`."""
 
 NOBODY = 0
 """Stands where no vehicle is ahead."""
 
 SINGLE_FRAME = "a single frame makes no pair"
+"""Reason under which readers count rows that are left out because a pair lasts one frame."""
 
 _SAME_LENGTH_M = 0.3
 """m: lengths of one vehicle differ by less."""

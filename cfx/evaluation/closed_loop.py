@@ -198,7 +198,8 @@ class _Track:
         self._position = batch.follower_position.gather(1, index)
         self.speed = batch.follower_speed.gather(1, index)
         self._acceleration = batch.follower_acceleration.gather(1, index)
-        # The agent must see nothing measured of the follower from here on.
+        # The agent must see nothing measured of the follower from here on. What reads a value too
+        # early shows as NaN in the results, not as a good result.
         for signal in (self._position, self.speed, self._acceleration):
             signal[:, self._now + 1 :] = torch.nan
         self._gap = self._leader.position - self._leader.length - self._position

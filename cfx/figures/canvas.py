@@ -25,6 +25,7 @@ from numpy.typing import ArrayLike, NDArray
 from cfx.figures.text import EDGE, INK, PALE, colour_of, method_label, percent
 
 Array = NDArray[np.float64]
+"""Values that a figure shows, of any shape."""
 
 
 def vehicle_colour(vehicle: int, vehicles: int) -> str:
@@ -74,6 +75,7 @@ class Paper:
 _PAPER: ContextVar[Paper] = ContextVar("paper", default=Paper())  # noqa: B039 - it is frozen
 
 Dash = Literal["solid"] | tuple[float, tuple[float, ...]]
+"""A line as Matplotlib takes it: solid, or an offset and the lengths of dashes and spaces."""
 
 DASHES: dict[str, Dash] = {
     "default": (0, (1.2, 1.4)),
@@ -88,6 +90,7 @@ DASHES: dict[str, Dash] = {
     "fixed_ar": (0, (1.2, 1.4)),
     "policy_sampled": (0, (1.2, 1.4)),
 }
+"""Dashes of each method's line; the others are solid."""
 _WIDTHS = {"real": 1.8, "leader": 1.0, "policy": 1.8}
 _ORDER = ("leader", "default", "population", "fixed", "shrunk", "real", "policy")
 """The real driver lies on top of leader and baselines, and below the policy compared with it."""

@@ -10,7 +10,10 @@ from typing import NamedTuple
 from cfx.evaluation.metrics.base import SCOPES
 
 MINUS = "\N{MINUS SIGN}"
+"""Stands before negative numbers in figures and tables."""
+
 NOTHING = "\N{EN DASH}"
+"""Stands in a cell of a table that has no value."""
 
 
 class MethodText(NamedTuple):
@@ -187,18 +190,34 @@ COLOURS = {
     "fixed_ar": "#003f66",
     "policy_sampled": "#b8860b",
 }
+"""Colours of vehicles and methods that cfx knows; `colour_of` gives those of others too."""
+
 OTHER_COLOUR = "#777777"
 """A method of a protocol that cfx does not know."""
 
 CLUSTER_COLOURS = ("#56b4e9", "#8c8c8c", "#e69f00")
 """Conservative, normal, aggressive: none of them a method's colour."""
 
-TRAIN_COLOUR, VALIDATION_COLOUR = "#56b4e9", "#cc79a7"
+TRAIN_COLOUR = "#56b4e9"
+"""Colour of losses on training data."""
+
+VALIDATION_COLOUR = "#cc79a7"
+"""Colour of losses on drivers that are kept for validation."""
+
 COLLISION_COLOUR = "#d00000"
+"""Colour of collisions."""
+
 INK = "#333333"
+"""Colour of labels and of lines at zero."""
+
 PALE = "#e4e4e4"
+"""Colour of the grid."""
+
 BAND = "#f3f3f3"
+"""Colour of areas behind the data, such as the range of recorded values."""
+
 EDGE = "#808080"
+"""Colour of the edges of axes and of lines of reference."""
 
 JOB_COLOURS = (
     "#332288",

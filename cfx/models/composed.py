@@ -194,6 +194,7 @@ RELAXATION_TIME = Parameter(
     "time constant with which the residual acceleration goes to its target",
     "two seconds: what one driver's errors of IDM take to decorrelate",
 )
+"""The parameter of `WithResidual` by which its acceleration beside the model's changes, s."""
 TARGET = Parameter(
     "residual_target",
     "m/s2",

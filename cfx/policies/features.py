@@ -16,6 +16,7 @@ from cfx.data.pairs import PairBatch
 from cfx.errors import nearest
 
 Summary = Literal["frames", "last", "mean", "mean_std"]
+"""What networks read of the frames of a window: all, the last, the mean, or mean and deviation."""
 
 
 class History(NamedTuple):

@@ -195,6 +195,7 @@ def _write_figures(
     tables: list[WrittenTable],
     metrics: Mapping[str, float],
 ) -> list[Path]:
+    # In this process, though they take seconds: a second one can be killed, late or absent.
     from cfx.figures.figure import where_figures_are, write_figures
 
     if not registry.installed("figure"):

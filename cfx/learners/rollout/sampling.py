@@ -22,7 +22,11 @@ _VALIDATION_STARTS = (0.2, 0.4, 0.6, 0.8)
 
 
 SHIFTED = 0.3
-"""Share of the cold starts that are made faster."""
+"""Share of the cold starts that are made faster.
+
+Accelerations stay as they were recorded: a factor on all distances and speeds would multiply them,
+and one on time as well would make time gaps grow with the speed.
+"""
 
 
 class TrajectorySampler:
@@ -65,7 +69,10 @@ class TrajectorySampler:
         return self.settings.draws * drivers
 
     def step_seed(self, step: int) -> int:
-        """Returns the seed of everything random in a gradient step."""
+        """Returns the seed of everything random in a gradient step.
+
+        It depends on nothing else, so that a training that was continued is the same training.
+        """
         return (self.seed * 1_000_003 + step) % 2**63
 
     def training(self, step: int) -> RolloutBatch:

@@ -28,7 +28,10 @@ with u_i what the network says of the parameter in unit space. Drawn are the par
 driving model and `residual_handover`, the time constant with which the model takes over. The first
 y_i is z_i itself, so that each y_i is standard normal in every window, whatever the network says. A
 sampled driver so is one draw of a continuous mixture over parameters, who changes slowly. No draw
-leaves the bounds; frozen parameters have the scale 0.
+leaves the bounds; frozen parameters have the scale 0. A model that takes its speed within one step,
+as Krauss's does, cancels noise on the acceleration in the next; noise on parameters stays. A finite
+mixture needs a simulation of each component and has no gradient for its weights, and noise that is
+correlated among parameters needs n^2 answers.
 
 Without a generator nothing is drawn, and the path of the centre is driven.
 
@@ -60,6 +63,7 @@ NOISE_SCALE = Parameter(
     "standard deviation of the residual acceleration",
     "Zhang and Sun (2024) find about 0.2 for drivers of highD",
 )
+"""The parameter that scales a sampled driver's noise on the acceleration, m/s2."""
 PARAMETER_TIME = Parameter(
     "parameter_time",
     "s",

@@ -16,6 +16,7 @@ from cfx.errors import DataError, nearest
 SCHEME = "cfx://"
 
 READY_FOLDER = Path(__file__).resolve().parent / "policies"
+"""Holds a folder for each ready-made policy, by its name."""
 
 
 def names() -> tuple[str, ...]:
