@@ -155,8 +155,9 @@ def tables_of(
         OSError: a file cannot be written.
     """
     tables = []
+    names = {one.name for one in chosen}  # installing something makes the tables anew
     for about in installed():
-        parts = parts_of(about, findings) if about in chosen else None
+        parts = parts_of(about, findings) if about.name in names else None
         path = None if folder is None else folder / file_of(about)
         if parts is None:
             if path is not None:
