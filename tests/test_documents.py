@@ -309,22 +309,48 @@ def test_the_forms_of_issues_are_complete(path: Path) -> None:
 
 
 def guide() -> list[tuple[str, str]]:
-    """Returns the shell and Python blocks of the guide, in order."""
+    """Returns the blocks of the guide by which a plugin comes about, in order."""
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
-    section = text.partition("## Writing a plugin\n")[2].partition("\n## ")[0]
-    return re.findall(r"^```(sh|python)\n(.*?)^```$", section, flags=re.DOTALL | re.MULTILINE)
+    section = text.partition("## Writing a plugin\n")[2].partition("\n## API versions")[0]
+    return re.findall(r"^```(sh|python|toml)\n(.*?)^```$", section, flags=re.DOTALL | re.MULTILINE)
+
+
+def test_the_guide_names_what_the_door_has() -> None:
+    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+    names = set(re.findall(r"\bcfx\.plugin\.(\w+)", text))
+    assert len(names) > 20
+    assert names <= set(cfx.plugin.__all__)
+    groups = {kind.entry_points for kind in (*registry.KINDS.values(), *registry.PARTS.values())}
+    doors = {"cfx.plugin", "cfx.errors", "cfx.sklearn", registry.API_GROUP}
+    assert set(re.findall(r"\bcfx\.[a-z]+\b", text)) <= groups | doors
+
+
+def test_the_table_of_parts_names_what_is_there() -> None:
+    text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| (\w+) \| `(cfx\.\w+)` \| `([\w.]+)` \|", text, flags=re.MULTILINE)
+    assert {part for part, _, _ in rows} == set(registry.PARTS)
+    for part, group, base in rows:
+        assert registry.PARTS[part].entry_points == group
+        assert pkgutil.resolve_name(base) is pkgutil.resolve_name(registry.PARTS[part].base)
 
 
 @pytest.mark.slow
 def test_the_guide_to_a_plugin_works_as_printed(tmp_path: Path) -> None:
     reader = Reader(tmp_path)
     steps = guide()
-    assert [language for language, _ in steps] == ["sh", "python", "python", "sh"]
+    shell = [block for language, block in steps if language == "sh"]
+    begin, install_and_run = shell
+    reader.shell(begin)
+    declaration = tmp_path / "cfx-pipes" / "pyproject.toml"
     for language, block in steps:
-        if language == "sh":
-            reader.shell(block)
-            continue
-        name = block.partition("\n")[0].removeprefix("# ")
-        (tmp_path / name).write_text(block, encoding="utf-8")
-    report = tmp_path / "outputs" / "pipes" / "report.html"
-    assert "pipes" in report.read_text(encoding="utf-8")
+        if language == "python":
+            name = block.partition("\n")[0].removeprefix("# ")
+            (tmp_path / name).write_text(block, encoding="utf-8")
+        elif language == "toml":
+            declaration.write_text(f"{declaration.read_text('utf-8')}\n{block}", encoding="utf-8")
+    reader.shell(install_and_run)
+    outputs = tmp_path / "outputs"
+    report = (outputs / "pipes" / "report.html").read_text(encoding="utf-8")
+    assert "pipes" in report
+    assert "Frames of the test parts" in report
+    assert list(outputs.rglob("figures/speed_errors.png"))

@@ -20,6 +20,7 @@ import cfx
 import cfx.plugin
 import cfx_report.section  # noqa: F401 - adds the kind of sections
 from cfx.core import registry
+from tests.printed import blocks
 
 ROOT = Path(__file__).resolve().parent.parent
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
@@ -179,7 +180,7 @@ def test_it_uses_the_doors_alone(plugin: Path) -> None:
     assert not wrong, "\n".join(wrong)
 
 
-def test_templates_and_examples_use_the_doors_alone(tmp_path: Path) -> None:
+def test_templates_examples_and_documents_use_the_doors_alone(tmp_path: Path) -> None:
     wrong = []
     templates = ROOT / "plugins" / "cfx-contracts" / "cfx_contracts" / "template"
     for template in templates.rglob("*.py.jinja"):
@@ -188,6 +189,14 @@ def test_templates_and_examples_use_the_doors_alone(tmp_path: Path) -> None:
         wrong += beside_the_doors(path)
     for path in ROOT.glob("plugins/*/examples/**/*.py"):
         wrong += beside_the_doors(path)
+    for path in ROOT.glob("docs/tutorials/*.py"):
+        wrong += beside_the_doors(path)
+    pages = [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("plugins/*/README.md")]
+    for page in pages:
+        for number, block in enumerate(blocks(page.relative_to(ROOT).as_posix(), "python")):
+            path = tmp_path / f"{page.parent.name} {page.stem} {number}"
+            path.write_text(block, encoding="utf-8")
+            wrong += beside_the_doors(path)
     assert not wrong, "\n".join(wrong)
 
 

