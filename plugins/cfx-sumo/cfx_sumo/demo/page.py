@@ -143,7 +143,7 @@ class _Plot(NamedTuple):
     """
 
     svg: str
-    method_label: str
+    label: str
     axes: list[list[float]]
 
 

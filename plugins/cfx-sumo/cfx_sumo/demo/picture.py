@@ -176,11 +176,11 @@ def _draw_pair(axes: Axes, one: SimulatedPair, frame: int, view: _View, *, named
             zorder=3,
         )
         if named:
-            method_label = f"{one.gap[kind][frame]:.1f} m".replace("-", "\N{MINUS SIGN}")
+            distance = f"{one.gap[kind][frame]:.1f} m".replace("-", "\N{MINUS SIGN}")
             axes.text(
                 front[0],
                 front[1] - CAR_LENGTH - 0.8,
-                method_label,
+                distance,
                 ha="center",
                 va="top",
                 fontsize=6.5,
