@@ -179,6 +179,7 @@ from .policies.driver_step import (
     DriverStep as DriverStep,
     Motion as Motion,
 )
+from .policies.driver_step import FREE_ROAD_M as FREE_ROAD_M
 from .policies.features import (
     History as History,
     Scaler as Scaler,

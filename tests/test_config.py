@@ -84,8 +84,8 @@ def test_a_job_config_cannot_be_changed() -> None:
             r"^style\.cluster='agressive': should be 'all', 'conservative'",
         ),
         ("metrics=[1,2]", r"^metrics\.0=1: should be a valid string\.$"),
-        ("metrics=[]", r"^metrics=\[\]: write all, or a list of names"),
-        ("metrics=3", r"^metrics=3: write all, or a list of names"),
+        ("metrics=[]", r"^metrics=\[\]: write own, all, or a list of names"),
+        ("metrics=3", r"^metrics=3: write own, all, or a list of names"),
         (
             "metrics=[rmse_gap,rmse_gap]",
             r"^metrics=.*: 'rmse_gap' stands there twice; write each once",

@@ -133,8 +133,6 @@ def _disturb(_config: Any, _folder: Path) -> Any:
     torch.use_deterministic_algorithms(False)
     torch.backends.cudnn.benchmark = True
     torch.set_float32_matmul_precision("medium")
-    for seed in (torch.manual_seed, np.random.seed, random.seed):
-        seed(0)
     limit_cores(1)
     logging.basicConfig(force=True, level=logging.DEBUG)
     logging.disable(logging.ERROR)

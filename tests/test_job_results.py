@@ -17,7 +17,7 @@ from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
-from cfx.results.table import Findings
+from cfx.results.table import Findings, installed
 from tests.made_up import GAINS, make_history, make_platoon, make_results, with_metric
 
 
@@ -156,7 +156,7 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
         evaluation = dataclasses.replace(
             evaluation, platoon=make_platoon({"policy": 1}), tables={"history": history}
         )
-    written = tables_of(findings(evaluation), tmp_path)
+    written = tables_of(findings(evaluation), installed(), tmp_path)
     further = {one.file for one in written if not one.about.part.always}
     assert further == {"pair_metrics.parquet", *(names if present else ())}
     assert {path.name for path in tmp_path.iterdir()} == {one.file for one in written}

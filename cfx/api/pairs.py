@@ -16,7 +16,6 @@ from cfx.app.overrides import IN_MEMORY, config_of
 from cfx.core import registry
 from cfx.core.component import validate
 from cfx.core.files import absolute
-from cfx.core.guest import guest
 from cfx.core.storage import is_url
 from cfx.data.base import Dataset
 from cfx.data.describe import dataset_of
@@ -193,7 +192,6 @@ class Pairs:
         return as_html(repr(self), self.summary)
 
 
-@guest()
 def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> Pairs:
     """Reads leader-follower pairs, as `data=DATASET data.path=SOURCE` on the command line.
 

@@ -40,9 +40,10 @@ from cfx.app.sweep.folder import (
 )
 from cfx.app.user_errors import explain, explained, is_user_error
 from cfx.core.console import console_logging
-from cfx.core.guest import guest, visit
+from cfx.core.guest import default_torch, guest, in_turn, own_hydra
 from cfx.core.memory import is_out_of_memory
 from cfx.core.processes import raise_if_signalled, signal_behind, terminable
+from cfx.core.progress import no_bars_on_terminals
 from cfx.core.registry import blame
 from cfx.core.storage import is_url
 from cfx.errors import (
@@ -221,7 +222,7 @@ def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
         config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
     )
     try:
-        with guest(), terminable():
+        with guest(), own_hydra(), terminable():
             sys.argv = ["cfx", *arguments]
             os.environ["HYDRA_FULL_ERROR"] = "1"
             hydra_source.register()
@@ -258,7 +259,7 @@ def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobR
     """
     if isinstance(overrides, str):
         raise ConfigError(f"give a list of overrides: cfx.run({overrides.split()!r})")
-    with visit():
+    with in_turn(), guest(), default_torch(), no_bars_on_terminals():
         with explained(overrides):
             config = hydra_source.composed(overrides)
             values = hydra_source.plain(config)

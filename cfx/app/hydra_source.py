@@ -15,6 +15,7 @@ from __future__ import annotations
 import importlib.util
 import logging
 import sys
+import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -22,14 +23,20 @@ from typing import TYPE_CHECKING, Any, cast
 
 import hydra
 import hydra.utils
-from hydra import compose, initialize_config_dir
+from hydra._internal.config_loader_impl import ConfigLoaderImpl
+from hydra._internal.utils import create_config_search_path
 from hydra.core.config_search_path import ConfigSearchPath
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.object_type import ObjectType
 from hydra.core.plugins import Plugins
+from hydra.core.singleton import Singleton
+from hydra.core.utils import setup_globals
 from hydra.plugins.config_source import ConfigLoadError, ConfigResult, ConfigSource
 from hydra.plugins.search_path_plugin import SearchPathPlugin
+from hydra.types import RunMode
+from hydra.version import VersionBase
 from omegaconf import DictConfig, OmegaConf
+from packaging.version import Version
 
 from cfx.app import nodes
 from cfx.core import registry
@@ -40,6 +47,12 @@ if TYPE_CHECKING:
     from cfx.core.command import Command
 
 log = logging.getLogger(__name__)
+
+VERSION_BASE = "1.3"
+"""Version of Hydra whose defaults configurations are composed with."""
+
+_HYDRA = threading.RLock()
+"""Held for the tenths of a second in which a configuration is composed or resolved."""
 
 
 class ComponentSource(ConfigSource):
@@ -132,6 +145,8 @@ def register() -> None:
     Call it before Hydra composes anything; doing it twice does no harm.
     """
     plugins = Plugins.instance()
+    if not OmegaConf.has_resolver("hydra"):
+        setup_globals()  # the resolvers `hydra` and `now`, which Hydra's applications have
     plugins.register(ComponentSource)
     plugins.register(ComponentSearchPath)
     OmegaConf.register_new_resolver("cfx_commands", listed_commands, replace=True)
@@ -169,28 +184,62 @@ def listed_commands() -> str:
 def composed(overrides: Sequence[str]) -> DictConfig:
     """Composes a configuration as the command line does, Hydra's own node included.
 
-    A running Hydra application is left alone.
+    A running Hydra application is left alone, and so are other threads: Hydra's `compose` would
+    need its one `GlobalHydra`.
 
     Raises:
         HydraException: an override fits nothing.
         PluginError: a chosen component cannot be loaded.
     """
-    with initialize_config_dir(
-        config_dir=str(nodes.conf_dir()), job_name="cfx", version_base="1.3"
-    ):
-        return compose("config", overrides=list(overrides), return_hydra_config=True)
+    base = Version(VERSION_BASE)
+    with _for_this_thread(VersionBase, "version_base", base):
+        loader = ConfigLoaderImpl(create_config_search_path(str(nodes.conf_dir())))
+        return loader.load_configuration(
+            "config", list(overrides), run_mode=RunMode.RUN, from_shell=False
+        )
 
 
 @contextmanager
 def resolving(config: DictConfig) -> Iterator[None]:
-    """Lets `${hydra:...}` mean this configuration, and puts a running application's back."""
-    holder = HydraConfig.instance()
-    before = holder.cfg
+    """Lets `${hydra:...}` mean this configuration in this thread."""
+    holder: HydraConfig = object.__new__(HydraConfig)  # one that is no singleton
     holder.set_config(config)
-    try:
+    with _for_this_thread(HydraConfig, "cfg", holder.cfg):
         yield
-    finally:
-        holder.cfg = before
+
+
+@contextmanager
+def _for_this_thread(singleton: type, attribute: str, value: Any) -> Iterator[None]:
+    """Gives an attribute of one of Hydra's singletons a value that other threads do not see.
+
+    Other threads that run Hydra read and write what the singleton had before.
+    """
+    instances: dict[Any, Any] = Singleton._instances  # noqa: SLF001 - Hydra has no way to replace one
+    thread = threading.get_ident()
+    with _HYDRA:
+        before = instances.get(singleton)
+        usual = before
+        if usual is None:
+            usual = object.__new__(singleton)
+            usual.__init__()
+        unused = dict(vars(usual))
+
+        def read(_: Any) -> Any:
+            return value if threading.get_ident() == thread else getattr(usual, attribute)
+
+        def write(_: Any, changed: Any) -> None:
+            setattr(usual, attribute, changed)
+
+        here = type(singleton.__name__, (singleton,), {attribute: property(read, write)})
+        mine: Any = object.__new__(here)
+        instances[singleton] = mine
+        try:
+            yield
+        finally:
+            if instances.get(singleton) is mine:
+                instances[singleton] = usual
+                if before is None and vars(usual) == unused:
+                    del instances[singleton]
 
 
 def plain(config: DictConfig) -> dict[str, Any]:

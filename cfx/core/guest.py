@@ -1,7 +1,15 @@
 """Leaves a program that calls cfx as it was: what belongs to the process, not to cfx.
 
-A script, a notebook or another Hydra application calls `cfx.run`. Hydra, MLflow, PyTorch, logging
-and the rest keep much for the whole process. `guest` puts all of it back, however the call ends.
+A script, a notebook or another Hydra application calls cfx, perhaps from several threads. Calls
+that compute wait for one another: each uses all cores by itself. `visit` is for functions on data
+frames, which change next to nothing that belongs to the process. `guest` is for a whole job
+(`cfx.run`, `in_turn` too), which has its log and its tracking: Hydra, MLflow, PyTorch and logging
+keep much for the whole process, and all of it is put back, however the job ends.
+
+Random numbers are not put back, because nothing here draws from the process's generators: another
+thread that draws from them would get its numbers again. What a plugin draws from them is its own
+affair; contracts of optimizers and learners check that it does not.
+
 Libraries that nobody has imported have no state yet; none is imported here.
 """
 
@@ -10,7 +18,6 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
-import random
 import signal
 import sys
 import threading
@@ -22,6 +29,21 @@ from typing import Any
 
 from cfx.core.threads import cores_limit, limit_cores
 
+_TURN = [threading.RLock()]
+"""What a call that computes holds; in a list, so that a forked process can have a new one."""
+
+if hasattr(os, "register_at_fork"):
+    # The thread that holds the parent's is not there.
+    os.register_at_fork(after_in_child=lambda: _TURN.__setitem__(0, threading.RLock()))
+
+_SET_BY_LIBRARIES = (
+    "KMP_DUPLICATE_LIB_OK",
+    "PYTORCH_NVML_BASED_CUDA_CHECK",
+    "TORCHINDUCTOR_CACHE_DIR",
+    "TRITON_CACHE_DIR",
+)
+"""Variables of the environment that libraries set as they are imported, and PyTorch's compiler."""
+
 _Part = tuple[Callable[[], Any], Callable[[Any], object]]
 """How a part of the state is read, and how it is put back."""
 
@@ -31,14 +53,30 @@ def guest() -> Iterator[None]:
     """Runs the block, or the function that it decorates, and puts the process's state back.
 
     That is: environment and working directory, `sys.argv`, logging, warnings' filters, signal
-    handlers, the random state of Python, NumPy and PyTorch, PyTorch's threads, default dtype,
-    gradient mode and deterministic flags, cfx's limit of cores, Hydra's singletons, MLflow's
-    tracking URI. MLflow's autologging rests meanwhile: training is no run of the caller's.
+    handlers, PyTorch's threads, default dtype, gradient mode and deterministic flags, cfx's limit
+    of cores, MLflow's tracking URI. MLflow's autologging rests meanwhile: training is no run of the
+    caller's.
     """
-    before = [(put_back, read()) for read, put_back in _parts()]
+    with _put_back(_parts()), warnings.catch_warnings(), no_autologging():
+        yield
+
+
+@contextlib.contextmanager
+def in_turn() -> Iterator[None]:
+    """Waits until no other thread is in such a block; a thread may enter one within another.
+
+    A program calls it, never work of ours: a thread that shares a call's work would wait forever.
+    """
+    with _TURN[0]:
+        yield
+
+
+@contextlib.contextmanager
+def _put_back(parts: Iterator[_Part]) -> Iterator[None]:
+    """Puts parts of the state back after the block, the last one first."""
+    before = [(put_back, read()) for read, put_back in parts]
     try:
-        with warnings.catch_warnings(), _own_hydra(), _no_autologging():
-            yield
+        yield
     finally:
         for put_back, value in reversed(before):
             put_back(value)
@@ -46,27 +84,33 @@ def guest() -> Iterator[None]:
 
 @contextlib.contextmanager
 def same_environment() -> Iterator[None]:
-    """Puts the environment's variables back, and nothing else: for calls that take milliseconds.
+    """Puts back the environment's variables that libraries set, and no others.
 
-    PyTorch's compiler names its cache in one.
+    What another thread has set meanwhile stays as it is.
     """
-    before = dict(os.environ)
+    before = {name: os.environ.get(name) for name in _SET_BY_LIBRARIES}
     try:
         yield
     finally:
-        _put_environment(before)
+        for name, value in before.items():
+            if value is None:
+                os.environ.pop(name, None)
+            elif os.environ.get(name) != value:
+                os.environ[name] = value
 
 
 @contextlib.contextmanager
 def default_torch() -> Iterator[None]:
     """Gives the block what PyTorch starts with: float32, gradients, tensors on the CPU.
 
-    So a job's numbers do not depend on what its caller has chosen. Use it in `guest`.
+    So a job's numbers do not depend on what its caller has chosen. All of it is the thread's own
+    but the default dtype, which is touched only where the caller has chosen another.
     """
     import torch
 
     dtype = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float32)
+    if dtype != torch.float32:
+        torch.set_default_dtype(torch.float32)
     try:
         with contextlib.ExitStack() as stack:
             stack.enter_context(torch.inference_mode(False))
@@ -75,20 +119,32 @@ def default_torch() -> Iterator[None]:
                 stack.enter_context(torch.device("cpu"))
             yield
     finally:
-        torch.set_default_dtype(dtype)
+        if torch.get_default_dtype() != dtype:
+            torch.set_default_dtype(dtype)
 
 
 @contextlib.contextmanager
 def visit() -> Iterator[None]:
-    """Runs a block that computes for a program: `guest` and `default_torch` together.
+    """Runs a block that computes for a program, which may have other threads.
 
-    Bars of progress are drawn in notebooks alone.
+    Only PyTorch's threads, the limit of cores and what libraries set as they are imported belong to
+    the process, and are put back. Bars of progress are drawn in notebooks alone.
     """
-    import torch  # noqa: F401 - a guest puts the state of what is there already back
+    import torch
 
     from cfx.core.progress import no_bars_on_terminals
 
-    with guest(), default_torch(), no_bars_on_terminals():
+    parts: list[_Part] = [
+        (cores_limit, limit_cores),
+        _if_changed(torch.get_num_threads, torch.set_num_threads),
+    ]
+    with (
+        in_turn(),
+        same_environment(),
+        _put_back(iter(parts)),
+        default_torch(),
+        no_bars_on_terminals(),
+    ):
         yield
 
 
@@ -97,10 +153,6 @@ def _parts() -> Iterator[_Part]:
     yield os.environ.copy, _put_environment
     yield Path.cwd, _put_directory
     yield lambda: (sys.argv, sys.argv[:]), _put_arguments
-    yield random.getstate, random.setstate
-    numpy = sys.modules.get("numpy")
-    if numpy is not None:
-        yield numpy.random.get_state, numpy.random.set_state
     yield cores_limit, limit_cores
     yield lambda: {one: signal.getsignal(one) for one in signal.valid_signals()}, _put_handlers
     yield _logging, _put_logging
@@ -119,9 +171,6 @@ def _torch_parts(torch: Any) -> Iterator[_Part]:
     yield torch.get_num_threads, torch.set_num_threads
     yield torch.get_default_dtype, torch.set_default_dtype
     yield torch.is_grad_enabled, torch.set_grad_enabled
-    yield torch.get_rng_state, torch.set_rng_state
-    if torch.cuda.is_initialized():
-        yield torch.cuda.get_rng_state_all, torch.cuda.set_rng_state_all
     yield _if_changed(  # setting it imports PyTorch's compiler: seconds
         lambda: (
             torch.are_deterministic_algorithms_enabled(),
@@ -201,7 +250,7 @@ def _put_logging(before: Any) -> None:
 
 
 @contextlib.contextmanager
-def _own_hydra() -> Iterator[None]:
+def own_hydra() -> Iterator[None]:
     """Lets the block have a Hydra of its own, whose singletons know nothing of the caller's."""
     if "hydra" not in sys.modules:
         yield
@@ -225,7 +274,7 @@ def _own_hydra() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _no_autologging() -> Iterator[None]:
+def no_autologging() -> Iterator[None]:
     """Lets MLflow's autologging rest, where MLflow is there."""
     of_mlflow = sys.modules.get("mlflow.utils.autologging_utils")
     # MLflow's block ends with autologging on, also in a block of the caller's that has it off.

@@ -159,11 +159,10 @@ def _of_policy(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
     if math.isfinite(error):
         values[SPEED_ERROR] = round(error, 3)
         said = f"RMSE of speed {error:.3f} m/s"
-        before = math.nan
         if compared is not None:
             before = metrics.get(key_of("rmse_speed", compared.baseline), math.nan)
-        if compared is not None and math.isfinite(before):
-            said += f" ({_CONSTANT[compared.baseline]} {before:.3f} m/s)"
+            if math.isfinite(before):
+                said += f" ({_CONSTANT[compared.baseline]} {before:.3f} m/s)"
         words.append(said)
     return values, "; ".join(words)
 

@@ -13,6 +13,7 @@ import logging
 import math
 import warnings
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
@@ -20,10 +21,11 @@ import lightning.pytorch as pl
 import pandas as pd
 import torch
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils.data import DataLoader
 
 from cfx.core.files import atomic_write
+from cfx.core.guest import no_autologging
 from cfx.core.threads import one_thread
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.policies.base import PolicyNetwork
@@ -92,10 +94,22 @@ class BatchedModule(pl.LightningModule):
         self.stale = torch.zeros(networks, dtype=torch.int64)
         self.rows: list[tuple[Tensor, Tensor]] = []
 
+    def begin_random_numbers(self, seed: int, device: torch.device) -> None:
+        """Makes the generators that training draws from; PyTorch's global one is the caller's.
+
+        Attributes that it sets:
+            generator: for dropout, on the device of the networks.
+            loaders_generator: for loaders of data, which draw a number for each epoch.
+        """
+        self.generator = torch.Generator(device).manual_seed(seed)
+        self.loaders_generator = self.generator
+        if device.type != "cpu":
+            self.loaders_generator = torch.Generator().manual_seed(seed)
+
     def val_dataloader(self) -> DataLoader[Any]:
         """Returns one batch, so that an epoch is validated once."""
         once: Any = [0]
-        return DataLoader(once, batch_size=None)
+        return DataLoader(once, batch_size=None, generator=self.loaders_generator)
 
     def configure_optimizers(self) -> Any:
         s = self.settings
@@ -196,47 +210,83 @@ def fit(
     Args:
         module: what is trained.
         epochs: at most.
-        seed: of the global generator, from which dropout draws.
+        seed: of what dropout draws.
         device: where.
         checkpoint: written after every epoch, so that interrupted training goes on there, and
             training that ended gives the same at once. None: no such file.
     """
     is_gpu = device.type == "cuda"
-    with torch.random.fork_rng(devices=[device] if is_gpu else []):
-        torch.manual_seed(seed)
-        with warnings.catch_warnings(), one_thread(), _quiet_lightning():
-            warnings.filterwarnings("ignore", module=r"lightning\.")
-            # torch's compiler looks at everything that it is given.
-            of_compiler = r"The \.grad attribute of a Tensor that is not a leaf"
-            warnings.filterwarnings("ignore", message=of_compiler)
-            trainer = pl.Trainer(
-                max_epochs=epochs,
-                accelerator="gpu" if is_gpu else "cpu",
-                devices=1,
-                logger=False,
-                callbacks=[] if checkpoint is None else [EveryEpoch(checkpoint)],
-                # Jobs in a queue of Slurm are no parts of one training on many machines.
-                plugins=[LightningEnvironment()],
-                enable_checkpointing=False,
-                enable_model_summary=False,
-                enable_progress_bar=False,
-                num_sanity_val_steps=0,
-                # Nothing random happens between batches, and they must come in order.
-                use_distributed_sampler=False,
-            )
-            start = None
-            if checkpoint is not None and checkpoint.is_file():
-                start = checkpoint
-                log.info("Training goes on from %s", checkpoint)
-            try:
-                trainer.fit(module, ckpt_path=start, weights_only=True)
-            except SystemExit as error:
-                # Lightning turns Ctrl-C into an exit.
-                if isinstance(error.__context__, KeyboardInterrupt):
-                    raise KeyboardInterrupt from None
-                raise
+    module.begin_random_numbers(seed, device)
+    with (
+        dropout_from(module.network, module.generator),
+        no_autologging(),
+        warnings.catch_warnings(),
+        one_thread(),
+        _quiet_lightning(),
+    ):
+        warnings.filterwarnings("ignore", module=r"lightning\.")
+        # torch's compiler looks at everything that it is given.
+        of_compiler = r"The \.grad attribute of a Tensor that is not a leaf"
+        warnings.filterwarnings("ignore", message=of_compiler)
+        trainer = pl.Trainer(
+            max_epochs=epochs,
+            accelerator="gpu" if is_gpu else "cpu",
+            devices=1,
+            logger=False,
+            callbacks=[] if checkpoint is None else [EveryEpoch(checkpoint)],
+            # Jobs in a queue of Slurm are no parts of one training on many machines.
+            plugins=[LightningEnvironment()],
+            enable_checkpointing=False,
+            enable_model_summary=False,
+            enable_progress_bar=False,
+            num_sanity_val_steps=0,
+            # Nothing random happens between batches, and they must come in order.
+            use_distributed_sampler=False,
+        )
+        start = None
+        if checkpoint is not None and checkpoint.is_file():
+            start = checkpoint
+            log.info("Training goes on from %s", checkpoint)
+        try:
+            trainer.fit(module, ckpt_path=start, weights_only=True)
+        except SystemExit as error:
+            # Lightning turns Ctrl-C into an exit.
+            if isinstance(error.__context__, KeyboardInterrupt):
+                raise KeyboardInterrupt from None
+            raise
     module.restore_best()
     module.network.to(device).eval()
+
+
+@contextlib.contextmanager
+def dropout_from(network: nn.Module, generator: torch.Generator) -> Iterator[None]:
+    """Lets the dropout layers of a network draw from a generator in the block.
+
+    PyTorch's own draw from the global generator, which another thread of the program may draw from
+    at the same time.
+    """
+    layers = []
+    for layer in network.modules():
+        if type(layer) is nn.Dropout and layer.p > 0:
+            layers.append(layer)
+            # A compiled step would draw numbers of its compiler's.
+            drawing = torch.compiler.disable(partial(_dropped, layer, generator))  # type: ignore[no-untyped-call]
+            layer.forward = drawing  # type: ignore[method-assign]
+    try:
+        yield
+    finally:
+        for layer in layers:
+            del layer.forward
+
+
+def _dropped(layer: nn.Dropout, generator: torch.Generator, values: Tensor) -> Tensor:
+    """Returns what `torch.nn.functional.dropout` does for the same numbers, bit by bit."""
+    if not layer.training:
+        return values
+    kept = torch.empty_like(values).bernoulli_(1.0 - layer.p, generator=generator)
+    if layer.p < 1:
+        kept.div_(1.0 - layer.p)
+    return values * kept
 
 
 @contextlib.contextmanager

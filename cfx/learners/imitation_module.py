@@ -172,7 +172,7 @@ class ImitationModule(BatchedModule):
 
     def train_dataloader(self) -> DataLoader[Any]:
         epoch: Any = [self.segments]
-        return DataLoader(epoch, batch_size=None)
+        return DataLoader(epoch, batch_size=None, generator=self.loaders_generator)
 
     def compile_step(self) -> None:
         """Compiles the error of a segment; the compiled function takes the method's place."""

@@ -11,7 +11,8 @@
 A simulation starts with the vehicle's acceleration h, which changes with the jerk at the start; the
 jerk decays with the time constant tau_j. The model's share m rises from 0 to 1 with the time
 constant tau_m. The residual r, in m/s2, goes from 0 to the target c with the time constant tau. Its
-variance is weighted by m, because the acceleration is known at first.
+variance is weighted by m, because the acceleration is known at first. Near standstill less of a
+negative residual counts (`WithResidual`).
 
 The usual form adds the model's error at the start: `a_model(t) + r(t)` with
 `r(t0) = a_measured(t0) - a_model(t0)`. It has the vehicle's acceleration in the first step alone:
@@ -246,6 +247,11 @@ _TIGHT_M = 1.0
 """m: gap below which no residual makes a vehicle faster than its leader. It is not wider: drivers
 in congestion follow closely."""
 
+_BRAKES_IN_FULL_MPS = 5.0
+"""m/s: speed from which a residual brakes in full. Up to it the weight rises with the square of the
+speed. On the ring of `cfx drive` cars of cfx://idm-acc then crawl at 1.5 m/s, which is what their
+model alone does; at 0.8 m/s with a weight that rises linearly, and at 0.1 m/s without any."""
+
 _HARD = 2.0
 """m/s2: from this needed deceleration on, the residual lessens no braking that is needed."""
 
@@ -262,6 +268,15 @@ class WithResidual(Composed):
     a deceleration of more than 2 m/s2 is needed to reach the leader's speed within the gap,
     b = (v - v_l)^2 / (2 s), it brakes at least as hard as that, or as hard as the model wants if
     that is less.
+
+    Nor does a residual hold a queue that the model lets move. A residual says by how much a moving
+    driver's acceleration differs from the model's, and at a standstill there is none to differ. So
+    a negative residual counts as
+
+        min(1, v / (5 m/s))^2 r
+
+    and a vehicle moves off as the model alone does. A positive one counts in full: without it
+    drivers who follow into a moving queue are too slow (docs/tried.md).
 
     Args:
         model: the inner model.
@@ -289,7 +304,7 @@ class WithResidual(Composed):
         share = -torch.expm1(-(follower.memory[..., _PASSED] / p[HANDOVER.name]).square())
         held = self._remembered(follower, _HELD, follower.acceleration)
         both = (1.0 - share) * held + share * alone
-        both = both + safe_sqrt(share) * follower.memory[..., _RESIDUAL]
+        both = both + safe_sqrt(share) * _residual_at(follower)
         braked = _braked(both, alone, follower, leader)
         return (follower.speed + dt * braked).clamp(min=0.0)
 
@@ -315,6 +330,13 @@ class WithResidual(Composed):
 def with_residual(space: ParameterSpace) -> ParameterSpace:
     """Returns a model's parameters with those of the residual behind them."""
     return replace(space, parameters=(*space, *RESIDUAL))
+
+
+def _residual_at(follower: Follower) -> Tensor:
+    """Returns the residual as far as it counts at the follower's speed, `(*batch,)`, m/s2."""
+    residual = follower.memory[..., _RESIDUAL]
+    weight = (follower.speed / _BRAKES_IN_FULL_MPS).clamp(max=1.0).square()
+    return residual.clamp(min=0.0) + weight * residual.clamp(max=0.0)
 
 
 def _braked(both: Tensor, alone: Tensor, follower: Follower, leader: Leader) -> Tensor:

@@ -315,6 +315,22 @@ class Agent:
         answer, after = self._answer(history, state)
         return self._apply(answer, history, after, noise)
 
+    def free_road_parameters(self, network: Tensor, base: Tensor | None) -> Tensor:
+        """Returns the parameters of D drivers whom nobody is ahead of, `(D, n)`, SI units.
+
+        Networks have not learned to choose any. They are those to which answers fade outside what
+        was learned: the base or the pooled parameters; or else the model's defaults.
+
+        Args:
+            network: which network drives each, `(D,)`.
+            base: of each driver, `(D, n)`, SI units; None where the head needs none.
+        """
+        if base is not None:
+            return base
+        if self.population is not None:
+            return self.head.completed(self.population[network].double())
+        return self.space.defaults().double().expand(len(network), -1)
+
     def burn_in(
         self, batch: PairBatch, until: Tensor, state: AgentState, since: Tensor | None = None
     ) -> AgentState:

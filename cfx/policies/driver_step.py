@@ -16,12 +16,17 @@ import torch
 from torch import Tensor
 
 from cfx.core.registry import create
-from cfx.errors import ConfigError
+from cfx.errors import ConfigError, DataError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.context import UNSEEN, DriverContext
 from cfx.policies.features import History
 from cfx.simulation.step import advance_vehicle
+
+FREE_ROAD_M = 1e6
+"""m: a vehicle this far ahead is none, and the road is free; so is a gap of infinity."""
+
+_GAP = History._fields.index("gap")
 
 
 class Motion(NamedTuple):
@@ -76,6 +81,10 @@ class DriverStep:
     State is passed in and returned, never kept. It is the closed loop in which cfx evaluates a
     policy, to the last bits.
 
+    On a free road, where the gap is infinity, the policy's own model drives with
+    `Agent.free_road_parameters`, and what is said of a leader does not count. Behind the next
+    leader a driver begins anew, as live drivers in SUMO do.
+
     Args:
         agent: chooses parameters; one network of it drives all.
         context: of the drivers, one for all: a base `(1, n)` and driver features `(1, k)`.
@@ -105,6 +114,8 @@ class DriverStep:
         self.dt = self.agent.dt
         self.noise_width = self.agent.head.noise_width
         self._begun = self.agent.begin(torch.zeros(1, dtype=torch.int64), context)
+        base = None if self._begun.base is None else self.agent.space.from_unit(self._begun.base)
+        self._free_parameters = self.agent.free_road_parameters(self._begun.network, base)
 
     def begin(self, drivers: int) -> DriverState:
         """Returns the state of D drivers before their first step: zeros."""
@@ -135,14 +146,21 @@ class DriverStep:
             state: what is remembered of them.
             ego: their vehicles.
             leader: the vehicles ahead.
-            gap: bumper to bumper, `(D,)`, m.
+            gap: bumper to bumper, `(D,)`, m; infinity: nobody is ahead.
             noise: standard normal, `(D, k)`, of which a driver whose window begins draws; None:
                 nothing is drawn.
 
         Returns:
             Speeds one time step later, `(D,)`, m/s, and the state then.
+
+        Raises:
+            DataError: a signal is not a number, or infinite where it is not the gap of a free road.
         """
-        state = self._remembered(state, ego, leader, gap)
+        leader, gap = _as_known(ego, leader, gap)
+        frame = _frame(ego, leader, gap)
+        if not bool(frame.isfinite().all()):
+            raise DataError(_not_finite(frame))
+        state = self._remembered(state, frame)
         due = self._is_due(state).nonzero().flatten()
         if len(due):
             drawn = None if noise is None else noise[due]
@@ -160,33 +178,47 @@ class DriverStep:
         """As a call, but no value branches, so that the step exports to other runtimes.
 
         The network answers for every driver in every step, and the answer counts where a window
-        begins.
+        begins. Signals that a call refuses make the speed of their driver NaN.
         """
-        state = self._remembered(state, ego, leader, gap)
+        leader, gap = _as_known(ego, leader, gap)
+        frame = _frame(ego, leader, gap)
+        state = self._remembered(state, frame)
         due = self._is_due(state)
         columns = []
         for new, old in zip(self._chosen(state, noise), state, strict=True):
             columns.append(torch.where(_as_wide(due, old), new, old))
-        return self._advanced(DriverState(*columns), ego, leader, gap)
+        speed, after = self._advanced(DriverState(*columns), ego, leader, gap)
+        # Bounds of a model may turn NaN into a number.
+        return torch.where(frame.isfinite().all(1), speed, torch.nan), after
 
-    def _remembered(
-        self, state: DriverState, ego: Motion, leader: Motion, gap: Tensor
-    ) -> DriverState:
-        """Returns the state with this instant; a first frame stands for those before it."""
-        begins = state.steps == 0
-        signals = History(leader.speed, leader.acceleration, ego.speed, ego.acceleration, gap)
-        frame = torch.stack(list(signals), -1)[..., None]
-        going = torch.cat([state.history[..., 1:], frame], -1)
-        initial = self.model.initial_memory(ego.speed)
+    def _remembered(self, state: DriverState, frame: Tensor) -> DriverState:
+        """Returns the state with this instant; a first frame stands for those before it.
+
+        A driver begins anew where a leader appears, and where there is none any more.
+
+        Args:
+            state: before it.
+            frame: the signals of `History`, `(D, 5)`.
+        """
+        is_free = frame[:, _GAP] >= FREE_ROAD_M
+        begins = (state.steps == 0) | (is_free != _on_free_road(state))
+        signals = frame[..., None]
+        going = torch.cat([state.history[..., 1:], signals], -1)
+        initial = self.model.initial_memory(History(*frame.unbind(1)).follower_speed)
+        chosen = torch.where(is_free[:, None], self._free_parameters, state.parameters)
         return state._replace(
-            history=torch.where(_as_wide(begins, going), frame, going),
+            steps=torch.where(begins, 0, state.steps),
+            history=torch.where(_as_wide(begins, going), signals, going),
+            parameters=torch.where(begins[:, None], chosen, state.parameters),
             memory=torch.where(_as_wide(begins, initial), initial, state.memory),
             network=torch.where(begins[:, None], self._begun.state[0], state.network),
+            latent=torch.where(begins[:, None], 0.0, state.latent),
+            score=torch.where(begins, 0.0, state.score),
         )
 
     def _is_due(self, state: DriverState) -> Tensor:
-        """Says for which drivers a window begins, bool `(D,)`."""
-        return state.steps % self.agent.windows.stride == 0
+        """Says for which drivers a window of the policy begins, bool `(D,)`."""
+        return (state.steps % self.agent.windows.stride == 0) & ~_on_free_road(state)
 
     def _chosen(self, state: DriverState, noise: Tensor | None) -> DriverState:
         """Returns the state of drivers whose window begins with their new parameters."""
@@ -220,6 +252,34 @@ class DriverStep:
             self.dt,
         )
         return after.speed, state._replace(steps=state.steps + 1, memory=after.memory)
+
+
+def _as_known(ego: Motion, leader: Motion, gap: Tensor) -> tuple[Motion, Tensor]:
+    """Returns leaders and gaps; on a free road a leader who drives as the ego does, far ahead."""
+    is_free = gap >= FREE_ROAD_M
+    speed = torch.where(is_free, ego.speed, leader.speed)
+    acceleration = torch.where(is_free, 0.0, leader.acceleration)
+    return Motion(speed, acceleration), torch.where(is_free, FREE_ROAD_M, gap)
+
+
+def _frame(ego: Motion, leader: Motion, gap: Tensor) -> Tensor:
+    """Returns the signals of `History` at one instant, `(D, 5)`."""
+    signals = History(leader.speed, leader.acceleration, ego.speed, ego.acceleration, gap)
+    return torch.stack(list(signals), -1)
+
+
+def _on_free_road(state: DriverState) -> Tensor:
+    """Says who had nobody ahead at the last frame, bool `(D,)`."""
+    return state.history[:, _GAP, -1] >= FREE_ROAD_M
+
+
+def _not_finite(frame: Tensor) -> str:
+    """Says which signal of a frame `(D, 5)` is not finite, in words."""
+    driver, signal = (~frame.isfinite()).nonzero()[0].tolist()
+    return (
+        f"{History._fields[signal]} of driver {driver} is {float(frame[driver, signal]):g}; give a"
+        " number for each signal (m/s, m/s2, m), and gap=inf where nobody is ahead"
+    )
 
 
 def _as_wide(drivers: Tensor, like: Tensor) -> Tensor:

@@ -107,6 +107,10 @@ _CONSTANT = ("fixed", "default")
 """Policies of cfx that keep parameters constant: such a job is a calibration."""
 
 
+Chosen = Literal["own", "all"] | tuple[str, ...]
+"""Which metrics, or tables, of those that are installed."""
+
+
 class JobParts(Settings):
     """The components that a job is made of, each by its node."""
 
@@ -120,18 +124,26 @@ class JobParts(Settings):
     simulator: Node = Field({"name": "memory"}, description="the simulator's node")
     engine: Node = Field({"name": "local"}, description="the engine's node")
     demo: Node | None = Field(None, description="the demonstration's node; null: there is none")
-    metrics: Literal["all"] | tuple[str, ...] = Field(
-        "all", description="what is measured: all that are installed, or some by name"
+    metrics: Chosen = Field(
+        "own",
+        description="what is measured: own: cfx's own; all: all that are installed; or a list of"
+        " names, in which own may stand",
+    )
+    tables: Chosen = Field(
+        "own",
+        description="which tables are written: own: cfx's own, and those of the plugins whose"
+        " components the job has; all: all that are installed; or a list of names, in which own may"
+        " stand",
     )
 
-    @field_validator("metrics", mode="before")
+    @field_validator("metrics", "tables", mode="before")
     @classmethod
-    def _several(cls, metrics: Any) -> Any:
-        if isinstance(metrics, str) and metrics != "all":
-            metrics = (metrics,)
-        if not metrics or not isinstance(metrics, str | list | tuple):
-            raise ValueError("write all, or a list of names such as [rmse_speed, rmse_gap]")
-        return metrics if isinstance(metrics, str) else each_once(metrics)
+    def _several(cls, chosen: Any) -> Any:
+        if isinstance(chosen, str) and chosen not in {"own", "all"}:
+            chosen = (chosen,)
+        if not chosen or not isinstance(chosen, str | list | tuple):
+            raise ValueError("write own, all, or a list of names such as [own, NAME]")
+        return chosen if isinstance(chosen, str) else each_once(chosen)
 
 
 class JobResources(Settings):

@@ -75,19 +75,30 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
             entry = registry.entry(kind.name, str(node["name"]))
             if entry.distribution != OWN:
                 found[entry.distribution] = entry.version
+    calibration = values.get("calibration")
+    posterior = calibration.get("posterior") if isinstance(calibration, Mapping) else None
+    if posterior not in {None, "none"}:
+        entry = registry.entry("posterior", str(posterior))
+        found[entry.distribution] = entry.version
     return found
 
 
-def metric_distributions(values: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the plugin distributions of a configuration's metrics, and their versions.
+def named_distributions(values: Mapping[str, Any]) -> dict[str, str]:
+    """Returns the plugin distributions of a configuration's metrics and tables with versions.
 
     Raises:
-        PluginError: there is no metric of that name.
+        PluginError: there is no metric, or no table, of that name.
     """
+    from cfx.core import registry
     from cfx.core.distributions import OWN
-    from cfx.evaluation.metrics.base import entries_of
+    from cfx.evaluation.metrics.base import OWN_METRICS, entries_of
 
-    entries = entries_of(values.get("metrics", "all"))
+    entries = list(entries_of(values.get("metrics", OWN_METRICS)))
+    tables = values.get("tables", OWN_METRICS)
+    if tables == "all":
+        entries += registry.entries("table")
+    elif not isinstance(tables, str):
+        entries += [registry.entry("table", name) for name in tables if name != OWN_METRICS]
     return {one.distribution: one.version for one in entries if one.distribution != OWN}
 
 

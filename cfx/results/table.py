@@ -2,14 +2,15 @@
 
 A table is a class of its own: which columns it has, what its rows are made of, which metrics and
 which lines of the console summarise it. A distribution brings one by an entry point of the group
-`cfx.tables`, whose name becomes that of its file. Jobs write every installed table into their
-folder and into MLflow; `cfx.load`, reports and figures (`Results.tables`) read it back.
+`cfx.tables`, whose name becomes that of its file. Jobs write cfx's own tables, those of the plugins
+whose components they have, and those that they name into their folder and into MLflow; `cfx.load`,
+reports and figures (`Results.tables`) read them back.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import chain
@@ -23,6 +24,7 @@ import pyarrow.parquet as pq
 
 from cfx.core import registry
 from cfx.core.component import Component
+from cfx.core.distributions import OWN
 from cfx.core.job_folder import unreadable
 from cfx.core.memory import in_units, total_memory
 from cfx.errors import DataError, PluginError
@@ -87,7 +89,7 @@ class Findings:
 class ResultTable(Component):
     """Base of every table of results.
 
-    Life cycle: a job calls `rows` of every installed table once, before anything is drawn or
+    Life cycle: a job calls `rows` of each of its tables once, before anything is drawn or
     logged; where it has any, `metrics`, and at its end `console`.
 
     Attributes:
@@ -221,6 +223,32 @@ class Kept:
 def installed() -> tuple[registry.Installed[ResultTable], ...]:
     """Returns all tables in their order; a broken one of a plugin is left out with a warning."""
     return registry.installed("table")
+
+
+def chosen_tables(
+    chosen: str | Sequence[str], plugins: Collection[str]
+) -> tuple[registry.Installed[ResultTable], ...]:
+    """Returns the tables that a job writes, in their order.
+
+    Args:
+        chosen: `own`: cfx's own, and those of the plugins whose components the job has; `all`: all
+            that are installed; or names, in which `own` may stand.
+        plugins: the distributions of the job's components.
+
+    Raises:
+        PluginError: there is no table of a name.
+    """
+    if chosen == "all":
+        return installed()
+    names = {chosen} if isinstance(chosen, str) else set(chosen)
+    for name in names - {"own"}:
+        registry.get("table", name)
+    tables = []
+    for one in installed():
+        is_own = one.distribution == OWN or one.distribution in plugins
+        if one.name in names or ("own" in names and is_own):
+            tables.append(one)
+    return tuple(tables)
 
 
 def file_of(one: registry.Installed[ResultTable]) -> str:

@@ -53,6 +53,11 @@ def test_without_driver_specific_parameters_it_is_over_pooled_ones() -> None:
     assert headline(metrics) == ({"improvement_percent": 10.0}, words)
 
 
+def test_a_baseline_whose_error_is_not_known_has_no_error_in_the_words() -> None:
+    _, words = headline({"rmse_improvement/mean": 0.1, "rmse_speed/policy": 0.5})
+    assert words == "+10.0 % over driver-specific; RMSE of speed 0.500 m/s"
+
+
 def test_a_calibration_is_known_by_the_drivers_own_parameters() -> None:
     metrics = {"rmse_speed/fixed": 0.7351, "rmse_speed/population": 0.6861}
     values, words = headline(metrics)

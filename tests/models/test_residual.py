@@ -132,6 +132,40 @@ def test_no_residual_keeps_a_vehicle_from_braking_for_its_leader() -> None:
     assert float(speed[100:].max()) < 1.0
 
 
+@pytest.mark.parametrize("model", [Krauss(), IDM(), W99()], ids=["krauss", "idm", "w99"])
+def test_no_residual_holds_a_queue_that_the_model_lets_move(model: DrivingModel) -> None:
+    """At rest, 12 m behind a leader who crawls: a queue moves on as it does without a residual."""
+    steps = 600
+    crawl = torch.full((steps, 1), 1.5).double()
+    position = 17.0 + 0.15 * torch.arange(steps).double()[:, None]
+    leader = Leader(position, crawl, crawl - crawl, torch.tensor(5.0).double())
+    parameters = model.space.defaults().tolist()
+    first = start(0.0, 0.0)
+    free = speeds(model, first, leader, *parameters, 1.0, 0.0, 0.0, 0.5, 2.0)
+    slowed = speeds(model, first, leader, *parameters, 1.0, -3.0, 0.0, 0.5, 2.0)
+    assert float(slowed[300:].mean()) == pytest.approx(1.5, abs=0.1)
+    assert float(free[300:].mean()) == pytest.approx(1.5, abs=0.1)
+    first_moves = [int((speed > 0.1).int().argmax()) for speed in (free, slowed)]
+    assert first_moves[1] <= first_moves[0] + 3
+
+
+def test_a_residual_brakes_in_full_at_speed_and_not_at_rest() -> None:
+    """Against the formula; the gradient with respect to the target is that of the weight."""
+    model = WithResidual(Steady(limits=None))
+    speed = torch.tensor([0.0, 1.0, 2.5, 5.0, 20.0], dtype=torch.float64)
+    for residual in (-0.8, 0.6):
+        memory = torch.tensor([0.0, 0.0, residual, 1e3]).double().expand(5, -1).clone()
+        memory.requires_grad_()
+        follower = Follower(torch.zeros(5).double(), speed, torch.zeros(5).double(), memory)
+        leader = Leader(*(torch.tensor(value).double() for value in (500.0, 20.0, 0.0, 5.0)))
+        p = model.space.unpack(model.space.defaults()) | {"a": torch.tensor(1.0).double()}
+        after = model.next_speed(follower, leader, p, DT)
+        weight = (speed / 5.0).clamp(max=1.0).square() if residual < 0 else torch.ones(5).double()
+        torch.testing.assert_close((after - speed) / DT, 1.0 + weight * residual)
+        (gradient,) = torch.autograd.grad(after.sum(), memory)
+        torch.testing.assert_close(gradient[:, 2], DT * weight)
+
+
 def test_each_vehicle_has_its_own_residual_and_candidates_broadcast() -> None:
     model = WithResidual(IDM())
     leader = far_leader(30, 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import pytest
@@ -12,11 +13,12 @@ from cfx.core.registry import create
 from cfx.data.pairs import PairBatch
 from cfx.errors import ConfigError, DataError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
-from cfx.models.base import DrivingModel
+from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
 from cfx.policies.driver_step import DriverState, DriverStep, Motion
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.step import advance_vehicle
 from tests.agents import adaptive
 from tests.drives import wavy_pairs
 
@@ -127,6 +129,68 @@ def test_a_driver_begins_anew_with_zeros() -> None:
     again, _ = step(state, motion, motion, gap)
     assert again[1] == first[1]
     assert again[0] != first[0]
+
+
+def on_roads(step: DriverStep, gaps: list[float], *, unbranched: bool = False) -> list[float]:
+    """Returns the speeds of one driver, in m/s, behind a leader at these gaps, in m."""
+    take = step.unbranched if unbranched else step.__call__
+    speed, state = torch.tensor([10.0]).double(), step.begin(1)
+    speeds = []
+    for gap in gaps:
+        # What is said of a leader who is not there does not count.
+        leader = torch.tensor([12.0 if gap < math.inf else math.nan]).double()
+        with torch.no_grad():
+            after, state = take(
+                state,
+                Motion(speed, torch.zeros(1).double()),
+                Motion(leader, leader - leader),
+                torch.tensor([gap]).double(),
+            )
+        speeds.append(float(after))
+        speed = after
+    return speeds
+
+
+@pytest.mark.parametrize("unbranched", [False, True])
+@pytest.mark.parametrize("head", HEADS)
+def test_without_a_leader_the_road_is_free_and_a_new_one_begins_anew(
+    head: str, unbranched: bool
+) -> None:
+    agent = adaptive({"name": "idm"}, **HEADS[head])
+    step = DriverStep(agent)
+    free = on_roads(step, [math.inf] * 4 + [20.0] * 7, unbranched=unbranched)
+    far = on_roads(step, [1e7] * 4, unbranched=unbranched)
+    assert free[:4] == far
+    parameters = agent.free_road_parameters(torch.zeros(1, dtype=torch.int64), agent.base)
+    model = step.model
+    still = torch.zeros(1).double()
+    alone = advance_vehicle(
+        model,
+        Follower(still, still + 10.0, still, model.initial_memory(torch.tensor([10.0]).double())),
+        Leader(still + 1e6, still + 10.0, still, still),
+        agent.space.unpack(parameters),
+        0.1,
+    )
+    assert free[0] == pytest.approx(float(alone.speed), abs=1e-12)
+    state, speed = step.begin(1), torch.tensor([free[3]], dtype=torch.float64)
+    anew, _ = step(state, Motion(speed, still), Motion(still + 12.0, still), still + 20.0)
+    assert free[4] == pytest.approx(float(anew), abs=1e-12)
+    assert on_roads(step, [20.0] * 3 + [math.inf], unbranched=unbranched)[3] > 0
+
+
+@pytest.mark.parametrize("signal", range(5))
+def test_what_is_no_number_is_refused_and_remembers_nothing(signal: int) -> None:
+    step = DriverStep(adaptive({"name": "idm"}))
+    values = [torch.full((3,), value).double() for value in (10.0, 0.0, 10.0, 0.0, 20.0)]
+    values[signal][1] = math.nan
+    v, a, v_l, a_l, gap = values
+    with pytest.raises(DataError, match=r"of driver 1 is nan; give a number for each signal"):
+        step(step.begin(3), Motion(v, a), Motion(v_l, a_l), gap)
+    speed, _ = step.unbranched(step.begin(3), Motion(v, a), Motion(v_l, a_l), gap)
+    assert speed.isnan().tolist() == [False, True, False]
+    v, a, v_l, a_l = (torch.full((3,), math.inf).double() for _ in range(4))
+    with pytest.raises(DataError, match="is inf"):
+        step(step.begin(3), Motion(v, a), Motion(v_l, a_l), torch.full((3,), 20.0).double())
 
 
 def test_networks_of_single_drivers_and_equations_of_a_simulator_are_refused() -> None:

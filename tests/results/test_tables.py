@@ -14,6 +14,7 @@ from cfx.results.table import (
     Column,
     Findings,
     ResultTable,
+    chosen_tables,
     file_of,
     installed,
     parts_of,
@@ -47,6 +48,25 @@ def test_the_list_of_files_says_what_each_table_holds() -> None:
     for one in installed():
         if one.distribution == "cfx-driving":
             assert f"| `{file_of(one)}` | {one.part.meaning}" in text, one.name
+
+
+def test_a_job_writes_own_tables_those_of_its_plugins_and_those_it_names(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    tables = chosen_tables("own", ())
+    own = [one.name for one in tables]
+    assert "pairs" in own
+    monkeypatch.setattr("cfx.results.table.installed", lambda: (*tables, CENSUS))
+    monkeypatch.setattr(registry, "get", lambda kind, name: Census)
+    for chosen, plugins, has_census in (
+        ("own", (), False),
+        ("own", ("cfx-census",), True),
+        (("own", "census"), (), True),
+        ("all", (), True),
+    ):
+        names = [one.name for one in chosen_tables(chosen, plugins)]
+        assert names == [*own, *(["census"] if has_census else [])]
+    assert [one.name for one in chosen_tables(("census",), ())] == ["census"]
 
 
 def test_a_table_that_a_protocol_delivers_is_written_and_read_back(tmp_path: Path) -> None:

@@ -53,6 +53,7 @@ class Car:
     told: list[float] = field(default_factory=list)
     mode: int = 31
     decel: float = 4.5
+    emergency_decel: float = 9.0
     acts_every: float | None = None
 
 
@@ -68,7 +69,8 @@ class Road:
         self.time, self.dt = 0.0, dt
         self.departed: list[str] = []
         self.options = {"step-method.ballistic": "false"}
-        self.vehicle = self.simulation = self
+        self.links: list[tuple[Any, ...]] = []
+        self.vehicle = self.vehicletype = self.simulation = self.lane = self
 
     def advance(self) -> None:
         self.time += self.dt
@@ -97,11 +99,30 @@ class Road:
         car = self.cars[name]
         return (car.leader, car.gap - 2.5) if car.leader else None
 
+    def getLength(self, name: str) -> float:  # noqa: N802
+        """Returns a vehicle's length, m; of a lane the distance to its end, 7 m."""
+        return self.cars[name].length if name in self.cars else 7.0
+
     def getMinGap(self, name: str) -> float:  # noqa: N802
         return 2.5
 
     def getDecel(self, name: str) -> float:  # noqa: N802
         return self.cars[name].decel
+
+    def getEmergencyDecel(self, name: str) -> float:  # noqa: N802
+        return self.cars[name].emergency_decel
+
+    def getStops(self, name: str, limit: int) -> tuple[()]:  # noqa: N802
+        return ()
+
+    def getLaneID(self, name: str) -> str:  # noqa: N802
+        return "lane"
+
+    def getLanePosition(self, name: str) -> float:  # noqa: N802
+        return 0.0
+
+    def getNextLinks(self, name: str) -> list[tuple[Any, ...]]:  # noqa: N802
+        return self.links
 
     def setDecel(self, name: str, decel: float) -> None:  # noqa: N802
         self.cars[name].kind = self.cars[name].kind.partition("@")[0] + f"@{name}"
@@ -121,7 +142,6 @@ class Road:
         fields = {
             "Speed": "speed",
             "Acceleration": "acceleration",
-            "Length": "length",
             "AllowedSpeed": "allowed",
         }
         fields |= {"TypeID": "kind", "SpeedMode": "mode"}
@@ -517,6 +537,74 @@ def test_a_vehicle_that_leaves_its_driver_has_its_own_bound_again() -> None:
     driver.release(road, "v")
     assert road.cars["v"].decel == 4.5
     assert road.cars["v"].mode == 31
+
+
+RED = ("after", False, False, False, ":light_0", "r", "s", 10.0)
+"""A red light at the end of the lane, as SUMO describes links."""
+
+
+def test_a_raised_bound_stays_while_a_light_needs_it() -> None:
+    """7 m before a red light at 9.3 m/s SUMO has planned to brake by 6.2 m/s2."""
+    road = Road(lead=Car(speed=0.0), v=Car(speed=9.3, gap=9.0, leader="lead"))
+    driver = Driver(adaptive({"name": "krauss"}))
+    driver.step(road, "v")
+    raised = road.cars["v"].decel
+    assert raised > 6.2
+    road.cars["v"].leader, road.links = None, [RED]
+    for speed, decel in ((9.3, raised), (8.1, raised), (7.8, 4.5)):
+        road.advance()
+        road.cars["v"].speed = speed
+        driver.step(road, "v")
+        assert road.cars["v"].decel == decel, f"{speed**2 / 14:.2f} m/s2 are needed"
+    assert road.cars["v"].kind == "calm"
+
+
+def test_a_vehicle_that_is_given_back_before_a_light_keeps_the_bound_that_it_needs() -> None:
+    road = Road(lead=Car(speed=0.0), v=Car(speed=9.3, gap=9.0, leader="lead"), w=Car(leader="lead"))
+    driver = Driver(adaptive({"name": "krauss"}))
+    driver.step(road, ["v", "w"])
+    road.links = [RED]
+    driver.release(road, "v")
+    assert (road.cars["v"].told[-1], road.cars["v"].mode) == (-1, 31)
+    assert road.cars["v"].decel > 6.2
+    road.advance()
+    road.cars["v"].speed = 7.0
+    driver.step(road, "w")
+    assert (road.cars["v"].decel, road.cars["v"].kind) == (4.5, "calm")
+
+
+def test_nobody_brakes_harder_than_their_vtypes_emergency_decel() -> None:
+    road = Road(lead=Car(speed=0.0), v=Car(speed=10.0, gap=3.0, leader="lead", emergency_decel=7.0))
+    Driver(adaptive({"name": "krauss"})).step(road, "v")
+    assert road.cars["v"].told[-1] == pytest.approx(10.0 - 0.7)
+    assert road.cars["v"].decel == pytest.approx(7.0)
+
+
+def test_a_vehicle_that_is_not_given_any_more_is_sumos_again_at_once() -> None:
+    road = platoon(3, mode=23)
+    driver = Driver(adaptive({"name": "krauss"}))
+    driver.step(road, ["v0", "v1", "v2"])
+    road.advance()
+    driver.step(road, ["v0", "v2"])
+    assert road.cars["v1"].told[-1] == -1
+    assert road.cars["v1"].mode == 23
+    assert driver.vehicles == ("v0", "v2")
+    road.advance()
+    driver.step(road, [])
+    assert [road.cars[name].told[-1] for name in ("v0", "v2")] == [-1, -1]
+    assert road.cars["v1"].told.count(-1) == 1
+
+
+def test_in_several_calls_an_instant_a_vehicle_is_given_back_at_the_next_instant() -> None:
+    road = platoon(3)
+    driver = Driver(adaptive({"name": "krauss"}))
+    for given in (("v0", "v1", "v2"), ("v0", "v1", "v2"), ("v0", "v1"), ("v0", "v1")):
+        for name in given:
+            driver.step(road, name)
+        road.advance()
+    assert road.cars["v2"].told[-1] == -1
+    assert all(-1 not in road.cars[name].told for name in ("v0", "v1"))
+    assert driver.vehicles == ("v0", "v1")
 
 
 def test_a_model_without_limits_does_not_go_live() -> None:

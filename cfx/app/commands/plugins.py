@@ -114,9 +114,9 @@ def _use(entry: registry.Entry, cls: Any) -> str:
     if entry.kind == "command":
         return f"Run it with cfx {name}; cfx {name} --help says what it takes."
     if entry.kind == "table":
-        return f"Every job that has rows of it writes {name}{cls.suffix}."
+        return f"tables=[own,{name}] writes {name}{cls.suffix} where a job has rows of it."
     if entry.kind == "metric":
-        return f"Every job measures it; with {group}={name} no others but those that a job needs."
+        return f"{group}=[own,{name}] measures it; {group}={name} only what jobs need beside it."
     return f"Choose it with {group}={name}."
 
 

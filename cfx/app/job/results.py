@@ -17,7 +17,7 @@ import yaml
 from cfx.app.overrides import command_of
 from cfx.core import registry
 from cfx.core.files import atomic_write, remove_leftovers, write_json
-from cfx.core.guest import visit
+from cfx.core.guest import default_torch, guest, in_turn, visit
 from cfx.core.job_folder import examine, parse_yaml, read_metrics
 from cfx.core.storage import RemoteFolder
 from cfx.data.style import StyleResult
@@ -34,6 +34,7 @@ from cfx.results.provenance import commit, version
 from cfx.results.table import (
     Findings,
     Kept,
+    ResultTable,
     WrittenTable,
     file_of,
     installed,
@@ -97,7 +98,7 @@ def write_job(
     with _writing(folder):
         (folder / METRICS).unlink(missing_ok=True)
         _write_config(folder, config)
-        tables = tables_of(findings, folder)
+        tables = tables_of(findings, parts.tables, folder)
         if any(pair.truth for pair in findings.pairs):
             with atomic_write(folder / "data.parquet") as temporary:
                 write_tidy(findings.pairs, temporary)
@@ -141,8 +142,12 @@ def _write_config(folder: Path, config: JobConfig) -> None:
         temporary.write_text(yaml.safe_dump(values, sort_keys=False), encoding="utf-8")
 
 
-def tables_of(findings: Findings, folder: Path | None = None) -> list[WrittenTable]:
-    """Returns the tables of the results; of those that are large the rows are left out.
+def tables_of(
+    findings: Findings,
+    chosen: Sequence[registry.Installed[ResultTable]],
+    folder: Path | None = None,
+) -> list[WrittenTable]:
+    """Returns the chosen tables of the results; of those that are large the rows are left out.
 
     Those that an earlier job left in the folder go, if one is given; these are written there.
 
@@ -150,8 +155,9 @@ def tables_of(findings: Findings, folder: Path | None = None) -> list[WrittenTab
         OSError: a file cannot be written.
     """
     tables = []
+    names = {one.name for one in chosen}  # installing something makes the tables anew
     for about in installed():
-        parts = parts_of(about, findings)
+        parts = parts_of(about, findings) if about.name in names else None
         path = None if folder is None else folder / file_of(about)
         if parts is None:
             if path is not None:
@@ -406,7 +412,8 @@ class JobResult:
             assert self.folder is not None
             return read_job(Origin(str(self.folder), self.folder)).results
         findings = self.computed.findings
-        return results_of(findings, tables_of(findings), self.metrics)
+        tables = tables_of(findings, self.computed.parts.tables)
+        return results_of(findings, tables, self.metrics)
 
     def save(self, folder: str | Path) -> JobResult:
         """Writes the job's folder, as a job of the command line does; MLflow is not told.
@@ -424,7 +431,7 @@ class JobResult:
         if self.computed is None:
             raise DataError(f"this job was read from {self.folder}; copy that folder")
         config, parts, findings = vars(self.computed).values()
-        with visit():
+        with in_turn(), guest(), default_torch():
             begin(Path(folder), config)
             kept = write_job(Path(folder), config, parts, findings)
         return replace(self, folder=Path(folder), figures=tuple(kept.figures))

@@ -96,7 +96,7 @@ def compute(config: JobConfig, pairs: PairSet) -> JobResult:
     config, parts, context = steps.without_files(config, pairs)
     findings = steps.find(context, parts, config.calibration)
     return results.JobResult(
-        metrics=results.measured(findings, results.tables_of(findings)),
+        metrics=results.measured(findings, results.tables_of(findings, parts.tables)),
         pairs=findings.evaluation.table,
         policy=findings.protocol_result.policy,
         figures=(),

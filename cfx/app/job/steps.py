@@ -42,7 +42,8 @@ from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
 from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
-from cfx.results.table import Findings
+from cfx.results.provenance import distributions
+from cfx.results.table import Findings, ResultTable, chosen_tables
 from cfx.results.tracker import folder_of, is_run_id
 from cfx.simulation.base import Simulator
 from cfx.simulation.rollout import MemorySimulator, MemoryStepper
@@ -134,6 +135,7 @@ class Parts:
     learner: Learner
     protocol: Protocol
     metrics: MetricSet
+    tables: tuple[registry.Installed[ResultTable], ...]
     engine: Engine
     demo: Demo | None = None
 
@@ -169,6 +171,7 @@ class Parts:
             learner=learner,
             protocol=protocol,
             metrics=MetricSet.of(config.metrics),
+            tables=chosen_tables(config.tables, distributions(config.model_dump())),
             engine=cast(Engine, registry.create("engine", config.engine)),
             demo=demo,
         )

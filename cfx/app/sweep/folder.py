@@ -295,7 +295,7 @@ def fingerprint(values: Mapping[str, Any]) -> str:
     """
     from cfx.results import provenance
 
-    plugins = provenance.distributions(values) | provenance.metric_distributions(values)
+    plugins = provenance.distributions(values) | provenance.named_distributions(values)
     data = _state_of_data(values.get("data"))
     parts = {"config": values, "cfx": provenance.version(), "plugins": plugins, "data": data}
     return content_key(parts)

@@ -193,6 +193,9 @@ def column_of(metric: str, scope: str = "test") -> str:
     return f"{scope}_{metric}"
 
 
+OWN_METRICS = "own"
+"""Stands for all metrics of cfx itself where names are given."""
+
 ALWAYS = ("rmse_speed", "rmse_gap", "collisions")
 """Measured in every job: the comparison of methods, the figures and the reports rest on them."""
 
@@ -250,12 +253,11 @@ class MetricSet:
     left_out: tuple[LeftOut, ...] = field(default=())
 
     @classmethod
-    def of(cls, chosen: Literal["all"] | Sequence[str] = "all") -> MetricSet:
+    def of(cls, chosen: str | Sequence[str] = OWN_METRICS) -> MetricSet:
         """Makes the metrics that are chosen, and those that every job measures.
 
         Args:
-            chosen: names, or all that are installed. Of all, a broken one of a plugin is left out
-                with a warning.
+            chosen: as `entries_of`. Of all, a broken one of a plugin is left out with a warning.
 
         Raises:
             PluginError: there is no metric of a name, or one that is named is broken.
@@ -277,15 +279,23 @@ class MetricSet:
         return cls(_ordered([_made(one) for one in entries if one.distribution == OWN]))
 
 
-def entries_of(chosen: Literal["all"] | Sequence[str] = "all") -> tuple[registry.Entry, ...]:
+def entries_of(chosen: str | Sequence[str] = OWN_METRICS) -> tuple[registry.Entry, ...]:
     """Returns the entries of the metrics that a job measures; imports none.
+
+    Args:
+        chosen: `own`: cfx's own; `all`: all that are installed; or names, in which `own` may stand.
 
     Raises:
         PluginError: there is no metric of a name.
     """
+    usable = [one for one in registry.entries("metric") if not registry.rivals(one)]
     if chosen == "all":
-        return tuple(one for one in registry.entries("metric") if not registry.rivals(one))
-    return tuple(registry.entry("metric", name) for name in sorted({*ALWAYS, *chosen}))
+        return tuple(usable)
+    names = {*ALWAYS, *([chosen] if isinstance(chosen, str) else chosen)}
+    if OWN_METRICS in names:
+        names.remove(OWN_METRICS)
+        names.update(one.name for one in usable if one.distribution == OWN)
+    return tuple(registry.entry("metric", name) for name in sorted(names))
 
 
 def leave_out(name: str, distribution: str, reason: str) -> LeftOut:

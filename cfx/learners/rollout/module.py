@@ -126,7 +126,7 @@ class RolloutModule(BatchedModule):
     def train_dataloader(self) -> DataLoader[Any]:
         """Returns the numbers of an epoch's gradient steps; what is sampled follows from them."""
         numbers: Any = range(self.settings.steps)
-        return DataLoader(numbers, batch_size=None)
+        return DataLoader(numbers, batch_size=None, generator=self.loaders_generator)
 
     def configure_optimizers(self) -> Any:
         optimizer = super().configure_optimizers()
@@ -145,8 +145,7 @@ class RolloutModule(BatchedModule):
         assert isinstance(optimizer, LightningOptimizer)
         assert isinstance(schedule, torch.optim.lr_scheduler.LambdaLR)
         step = self.current_epoch * self.settings.steps + int(number)
-        # Dropout draws from the global generator.
-        torch.manual_seed(self.sampler.step_seed(step))
+        self.generator.manual_seed(self.sampler.step_seed(step))  # for dropout
         optimizer.zero_grad()
         total = torch.zeros(len(self.dataset.pair), device=self.dataset.pair.device)
         for loss in self.step_losses(step):

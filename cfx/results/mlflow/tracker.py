@@ -90,7 +90,7 @@ class MlflowTracker(Tracker):
         values = config.model_dump(mode="json")
         names = {kind: str(values[kind].get("name", "")) for kind in _NAMED}
         plugins = provenance.distributions(values)
-        every_plugin = {**plugins, **provenance.metric_distributions(values)}
+        every_plugin = {**plugins, **provenance.named_distributions(values)}
         tags = {
             **provenance.plugin_tags(every_plugin),
             **names,

@@ -146,7 +146,7 @@ def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:
     if kind.name == "dataset":
         job += " data.path=FILE.csv"
     if kind.name == "metric":
-        job = "  # every job measures it"
+        job = f"metrics=[own,{name}]"
     folder = shlex.quote(str(target))
     package = shlex.quote(f"{target}[test]")
     return (

@@ -83,6 +83,14 @@ def test_drivers_behind_drive_as_evaluation_does_behind_the_ego() -> None:
     np.testing.assert_allclose(speeds, expected.speed[0, :79].numpy(), rtol=0, atol=1e-5)
 
 
+def test_an_action_that_is_no_number_is_refused() -> None:
+    env = CarFollowingVectorEnv(2, recording=PAIRS)
+    env.reset(seed=0)
+    with pytest.raises(DataError, match=r"the action of environment 1 is not a number \(NaN\)"):
+        env.step(np.array([[0.5], [np.nan]]))
+    assert np.isfinite(env.step(np.zeros((2, 1)))[0]).all()
+
+
 def test_drivers_react_to_the_ego() -> None:
     env = CarFollowingVectorEnv(2, recording=PAIRS, driver=AGENT, followers=3)
     env.reset(options={"pair": "p0"})

@@ -71,6 +71,29 @@ def test_it_drives_as_cfx_does(unit: Path) -> None:
     np.testing.assert_allclose(found["next_speed"][1:], expected, atol=1e-5)
 
 
+def next_speed(unit: Path, gap: float) -> float:
+    """Returns the speed after one step, m/s, of a driver at 10 m/s behind a leader as fast."""
+    starts = {"ego_speed": 10.0, "leader_speed": 10.0, "gap": gap}
+    found = fmpy.simulate_fmu(
+        str(unit),
+        stop_time=0.1,
+        step_size=0.1,
+        output_interval=0.1,
+        start_values=starts,
+        output=["next_speed"],
+    )
+    return float(found["next_speed"][1])
+
+
+def test_nobody_ahead_is_a_free_road_and_no_number_is_an_error(unit: Path) -> None:
+    step = DriverStep(adaptive({"name": "idm"}))
+    motion = Motion(torch.tensor([10.0]).double(), torch.zeros(1).double())
+    speed, _ = step(step.begin(1), motion, motion, torch.tensor([np.inf]).double())
+    assert next_speed(unit, np.inf) == pytest.approx(float(speed), abs=1e-5)
+    with pytest.raises(Exception, match="fmi3DoStep"):
+        next_speed(unit, np.nan)
+
+
 def test_a_communication_step_of_another_length_is_an_error(unit: Path) -> None:
     with pytest.raises(Exception, match="fmi3DoStep"):
         fmpy.simulate_fmu(str(unit), stop_time=1.0, step_size=0.25, output_interval=0.25)

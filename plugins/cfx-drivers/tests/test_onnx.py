@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 import torch
 from numpy.typing import NDArray
@@ -127,6 +128,25 @@ def test_one_of_several_networks_is_named(tmp_path: Path) -> None:
     assert about["cfx.model"] == "idm"
     assert about["cfx.policy"].endswith("#two")
     assert (tmp_path / "driver.md").is_file()
+
+
+def test_nobody_ahead_is_a_free_road_and_no_number_stays_none() -> None:
+    step = DriverStep(adaptive({"name": "idm"}))
+    session = onnxruntime.InferenceSession(graph_of(step, "here").SerializeToString())
+    values = {"ego_speed": 10.0, "ego_acceleration": 0.0, "leader_speed": 10.0}
+    given = {
+        name: np.full(3, value) for name, value in (values | {"leader_acceleration": 0.0}).items()
+    }
+    given["gap"] = np.array([20.0, np.inf, np.nan])
+    for name, value in step.begin(3)._asdict().items():
+        if value.numel():
+            given[name] = value.numpy()
+    speed = session.run(["next_speed"], given)[0]
+    v, still = torch.full((2,), 10.0).double(), torch.zeros(2).double()
+    gap = torch.tensor([20.0, np.inf]).double()
+    expected, _ = step(step.begin(2), Motion(v, still), Motion(v, still), gap)
+    np.testing.assert_allclose(speed[:2], expected.numpy(), rtol=0, atol=1e-5)
+    assert np.isnan(speed[2])
 
 
 class Branching(PolicyNetwork):

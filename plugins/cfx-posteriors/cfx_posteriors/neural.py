@@ -49,6 +49,7 @@ from cfx_posteriors.importance import (
     tempering_power,
     weighted_quantiles,
 )
+from cfx_posteriors.random_numbers import DrawsFrom
 
 FIRST = 500
 """Simulations of each driver all over the prior, which give the first region."""
@@ -284,7 +285,7 @@ class _Round:
 def learn(posterior: Posterior, shares: Tensor, *, seed: int, memory: int) -> Learned:
     """Returns samples of each driver's posterior.
 
-    PyTorch's random numbers go on afterwards as if nothing had been drawn.
+    sbi draws from PyTorch's global generator; here it draws from one of its own.
 
     Args:
         posterior: of P drivers.
@@ -292,8 +293,7 @@ def learn(posterior: Posterior, shares: Tensor, *, seed: int, memory: int) -> Le
         seed: the same seed gives the same samples.
         memory: bound in bytes for what is simulated at once.
     """
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
+    with DrawsFrom(torch.Generator().manual_seed(seed)):
         return _learned(posterior, shares, seed, memory)
 
 

@@ -15,7 +15,14 @@ from cfx.core.distributions import install_line
 from cfx.errors import ConfigError
 from cfx.policies.checkpoint import save_agent
 from cfx_sumo.demo.motorway import SHIPPED
-from cfx_sumo.drive.run import Collision, ScenarioRun, Tally, parse_drivers, report
+from cfx_sumo.drive.run import (
+    Collision,
+    ScenarioRun,
+    Tally,
+    command_line,
+    parse_drivers,
+    report,
+)
 from tests.agents import adaptive
 from tests.forks import Forks
 
@@ -285,6 +292,40 @@ def test_a_vehicle_that_collides_teleports_or_changes_lanes_is_counted_and_ends_
     assert steps == 120
 
 
+def test_collisions_at_junctions_are_looked_for_unless_the_user_says_otherwise() -> None:
+    line = command_line(Path("town.sumocfg"))
+    assert line[line.index("--collision.check-junctions") + 1] == "true"
+    for own in (["--collision.check-junctions", "false"], ["--collision.check-junctions=false"]):
+        assert command_line(Path("town.sumocfg"), own) == [*line[:-2], *own]
+
+
+RUNS_RED_LIGHTS = """
+import sys
+sys.modules["pyarrow"] = None
+import json
+from pathlib import Path
+from cfx_sumo.drive.run import run_scenario
+Path("cross.rou.xml").write_text('''<routes><vType id="car" sigma="0" speedDev="0"/>
+  <flow id="east" type="car" from="left0A0" to="C0right0" begin="0" end="60" period="3"/>
+  <flow id="north" type="car" from="bottom0A0" to="A2top0" begin="0" end="60" period="3.5"/>
+  </routes>''')
+from cfx_sumo.drive.scenarios import SCENARIOS
+town = SCENARIOS["town"].network
+Path("cross.sumocfg").write_text(f'''<configuration><input><net-file value="{town}"/>
+  <route-files value="cross.rou.xml"/></input><processing><collision.action value="warn"/>
+  </processing></configuration>''')
+run = run_scenario(Path("cross.sumocfg"), {"car": "cfx://i80-idm"}, end=60, step=0.5, speed_mode=0)
+print(json.dumps([run.tallies["car"].crossings, run.crossings_of_sumo]))
+"""
+
+
+def test_crossing_paths_are_counted_beside_those_of_sumo_alone(tmp_path: Path, live: Forks) -> None:
+    """Drivers without SUMO's checks run red lights; SUMO's own do not."""
+    crossings, of_sumo = python(live, RUNS_RED_LIGHTS, tmp_path)
+    assert crossings > 0
+    assert of_sumo == 0
+
+
 def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
     tally = Tally(
         {"a", "b"},
@@ -296,6 +337,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         hardest_braking=6.25,
         collisions=1,
         below_min_gap=8,
+        crossings=5,
         teleports=4,
     )
     tally.braking.add([0.0] * 189 + [0.49] * 10 + [4.99])
@@ -316,17 +358,22 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
         collisions=[
             Collision(3.1, "calm", "a", "b", "road_0", 51.26, -0.2),
             Collision(4.0, "calm", "b", "x", "road_0", 80.0, 2.391),
+            Collision(4.5, "calm", "a", "y", ":n_0", 3.0, None, crossing=True),
         ],
+        crossings_of_sumo=6,
     )
     report(run)
     out = capsys.readouterr().out
     rows = [line.split() for line in out.splitlines() if "calm" in line]
-    assert rows[0] == ["calm", "2", "75%", "12.00", "3", "1", "8", "4"]
+    assert rows[0] == ["calm", "2", "75%", "12.00", "3", "1", "8", "5", "4"]
     assert rows[1] == ["calm", "0.49", "4.99", "6.25", "2", "25.0%", "50.0%"]
     assert rows[2] == ["calm", "10.05,", "12.05,", "14.05", *["nan,", "nan,", "nan"] * 2]
     assert rows[3][0] == "calm:"
     assert "3.10 s: a behind b on road_0 at 51.3 m: contact, gap -0.20 m" in out
     assert "4.00 s: b behind x on road_0 at 80.0 m: below minGap, gap 2.39 m" in out
+    assert "4.50 s: a and y, whose paths cross, on :n_0 at 3.0 m" in out
+    assert "paths cross at a junction: 5; where SUMO's own models drive all" in out
+    assert "in the same scenario: 6" in out
     assert "calm: RMSE of speed below 1.20 m/s" in out
     assert "calm: 3 % of steps outside what the policy has learned (speed above 18 m/s)" in out
     assert next(line.split() for line in out.splitlines() if "its recording" in line)[2:5] == [

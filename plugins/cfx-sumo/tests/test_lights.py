@@ -92,7 +92,7 @@ def test_by_default_nobody_runs_a_red_light_passes_a_stop_or_collides(
         command = ["-m", "cfx", "drive", "town.sumocfg", "--drivers", "car=cfx://i80-idm"]
         said = python(live, tmp_path, *command)
         row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
-        assert row[5:8] == ["0", "0", "0"], "contact, below minGap, teleports"
+        assert row[5:9] == ["0"] * 4, "contact, below minGap, crossing paths, teleports"
     else:
         python(live, tmp_path, "-c", OWN_PROGRAM.replace("END", str(END_S)))
     assert red_lights_run(tmp_path) == []

@@ -76,6 +76,66 @@ def test_a_simulation_that_goes_on_from_a_saved_state_is_the_same(
     assert another == expected
 
 
+RAISED = """
+import sys
+sys.modules["pyarrow"] = None
+import json
+import libsumo
+from cfx_sumo.drive.scenarios import SCENARIOS
+from cfx_sumo.live.control import VehicleControl
+from pathlib import Path
+
+scenario = SCENARIOS["ring"].write(Path("."))
+command = ["sumo", "-c", str(scenario), "--no-step-log", "--no-warnings",
+           "--save-state.precision", "17"]
+
+def at(vehicle="car7"):
+    return [libsumo.vehicle.getTypeID(vehicle), libsumo.vehicle.getDecel(vehicle)]
+
+def brakes(control, *decelerations):
+    said = []
+    for deceleration in decelerations:
+        needed = {"car7": deceleration} if deceleration else {}
+        control.bound_braking(libsumo, ["car7"], needed)
+        libsumo.simulationStep()
+        said.append(at())
+    return said
+
+libsumo.start(command)
+libsumo.simulationStep()
+control = VehicleControl(31)
+control.take(libsumo, "car7")
+brakes(control, 7.0588235)
+libsumo.simulation.saveState("sumo.xml")
+state = json.loads(json.dumps(control.described()))
+said = [brakes(control, 7.0588235, 0, 6.1, 0)]
+libsumo.simulation.loadState("sumo.xml")
+control.go_on(libsumo, state)
+said.append(brakes(control, 7.0588235, 0, 6.1, 0))
+libsumo.simulation.saveState("again.xml")
+state = json.loads(json.dumps(control.described()))
+libsumo.close()
+libsumo.start([*command, "--load-state", "again.xml"])
+new = VehicleControl(31)
+new.go_on(libsumo, state)
+said.append(brakes(new, 7.0588235, 0, 6.1, 0))
+libsumo.close()
+print(json.dumps(said))
+"""
+
+
+def test_a_raised_decel_goes_on_to_the_last_bit_and_can_be_raised_again(
+    tmp_path: Path, live: Forks
+) -> None:
+    """SUMO's state has the vType `car@7`, with two decimals, and makes no second one."""
+    done = live.run(["-c", RAISED], tmp_path)
+    assert done.returncode == 0, done.stderr
+    expected, same, another = json.loads(done.stdout.splitlines()[-1])
+    assert expected == [["car@car7", 7.0588235], ["car", 4.5], ["car@car7", 6.1], ["car", 4.5]]
+    assert same == expected
+    assert another == expected
+
+
 def test_a_state_goes_on_where_it_was_saved_alone(tmp_path: Path) -> None:
     road = platoon(2)
     driver = Driver(adaptive({"name": "krauss"}))

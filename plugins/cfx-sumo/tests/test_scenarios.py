@@ -51,7 +51,7 @@ def town(live: Forks, folder: Path, policy: str, end: int, step: float) -> None:
     said = drive(live, folder, *command)
     row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
     assert int(row[1]) > 0.5 * end
-    assert row[5:8] == ["0", "0", "0"]  # contact, gaps below minGap, teleports
+    assert row[5:9] == ["0"] * 4  # contact, gaps below minGap, crossing paths, teleports
 
 
 def test_the_town_has_no_collisions(tmp_path: Path, live: Forks) -> None:

@@ -59,7 +59,7 @@ def test_a_plugins_metric_stands_in_every_result(
     plugin(install, "mean_gap", GOOD)
     store = f"sqlite:///{tmp_path / 'mlflow.db'}"
     overrides = [one for one in QUICK if not one.startswith("tracking")]
-    result = cfx.run([*overrides, f"tracking.uri={store}"])
+    result = cfx.run([*overrides, f"tracking.uri={store}", "metrics=[own,mean_gap]"])
 
     assert result.metrics["mean_gap/fixed"] > 0
     assert result.metrics["mean_gap/real"] > 0
@@ -154,7 +154,7 @@ def test_broken_metrics_are_left_out_told_and_counted(
         plugin(install, name, code)
     plugin(install, "mean_gap", GOOD)
     with caplog.at_level(logging.WARNING, logger="cfx"):
-        result = cfx.run(list(QUICK))
+        result = cfx.run([*QUICK, "metrics=all"])
     assert "mean_gap/fixed" in result.metrics
     said = json.loads((result.folder / "data.json").read_text())
     assert {one["name"] for one in said["metrics_left_out"]} == set(BROKEN)
@@ -182,3 +182,11 @@ def test_cfxs_own_metric_cannot_be_replaced(install: Installer) -> None:
     plugin(install, "rmse_speed", "raise SystemExit(1)")
     found = {one.name: one.distribution for one in MetricSet.of("all").metrics}
     assert found["rmse_speed"] == "cfx-driving"
+
+
+def test_what_is_installed_is_not_measured_unless_it_is_named(install: Installer) -> None:
+    """So that the columns of a job's files do not depend on the machine."""
+    own = [one.name for one in MetricSet.of().metrics]
+    plugin(install, "mean_gap", GOOD)
+    assert [one.name for one in MetricSet.of().metrics] == own
+    assert {one.name for one in MetricSet.of(["own", "mean_gap"]).metrics} == {*own, "mean_gap"}

@@ -5,6 +5,7 @@ It runs where the FMU is simulated, so it imports NumPy and ONNX Runtime alone, 
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -75,7 +76,10 @@ class CfxDriver(Fmi3Slave):  # type: ignore[misc]  # PythonFMU3 has no types
         self.next_speed = self._now("ego_speed")
 
     def do_step(self, current_time: float, step_size: float) -> Fmi3StepResult:
-        """Gives the speed at the end of a step of `dt`, from what the inputs say at its begin."""
+        """Gives the speed at the end of a step of `dt`, from what the inputs say at its begin.
+
+        A step with an input that is not a number is discarded: nothing of it is remembered.
+        """
         if abs(step_size - self.dt) > _SAME_S:
             self.log(
                 f"this driver steps by {self.dt:g} s, not by {step_size:g} s;"
@@ -89,7 +93,16 @@ class CfxDriver(Fmi3Slave):  # type: ignore[misc]  # PythonFMU3 has no types
             self._state["noise"] = self._random.standard_normal(self._state["noise"].shape)
         outputs = [one.name for one in self._session.get_outputs()]
         values = dict(zip(outputs, self._session.run(None, self._state), strict=True))
-        self.next_speed = float(values.pop("next_speed")[0])
+        speed = float(values.pop("next_speed")[0])
+        if math.isnan(speed):
+            given = ", ".join(f"{name}={self._now(name):g}" for name in self._signals)
+            self.log(
+                f"the step is discarded, as an input is not a number: {given}; set each of them,"
+                " and gap to infinity where nobody is ahead",
+                status=Fmi3Status.discard,
+            )
+            return Fmi3StepResult(status=Fmi3Status.discard)
+        self.next_speed = speed
         self.acceleration = (self.next_speed - self._now("ego_speed")) / self.dt
         for name, value in values.items():
             self._state[name.removeprefix("next_")] = value
@@ -118,7 +131,7 @@ _MEANING = {
     "ego_acceleration": "its acceleration over the last step, (v(t) - v(t - dt)) / dt",
     "leader_speed": "speed of the vehicle ahead",
     "leader_acceleration": "acceleration of the vehicle ahead",
-    "gap": "to the vehicle ahead, bumper to bumper",
+    "gap": "to the vehicle ahead, bumper to bumper; infinity: nobody is ahead",
     "next_speed": "speed of the vehicle one step later",
     "acceleration": "acceleration of the vehicle until then",
 }

@@ -180,9 +180,20 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
         return self._observation(), self._information(self._no_jerk())
 
     def step(self, actions: Array) -> tuple[Array, Array, Array, Array, dict[str, Any]]:
-        """Takes one time step in every environment; one whose episode is over begins the next."""
+        """Takes one time step in every environment; one whose episode is over begins the next.
+
+        Raises:
+            DataError: an action is not a number.
+        """
         wanted = torch.from_numpy(np.asarray(actions, dtype=np.float64)).view(self.num_envs)
         over = self._over.clone()
+        unusable = (wanted.isnan() & ~over).nonzero().flatten().tolist()
+        if unusable:
+            low, high = -self._limits.emergency_deceleration, self._limits.acceleration
+            raise DataError(
+                f"the action of environment {unusable[0]} is not a number (NaN); give the ego's"
+                f" acceleration, {low:g} to {high:g} m/s2"
+            )
         before = self._acceleration[:, 0].clone()
         self._advance(wanted)
         outcome = self._outcome((self._acceleration[:, 0] - before) / self.dt)

@@ -13,6 +13,8 @@ from cfx.plugin import DriverState, DriverStep, Motion
 from cfx_drivers.onnx.graph import SIGNALS, kept_of
 
 VEHICLES, STEPS, LENGTH_M = 5, 300, 5.0
+FREE = range(200, 220)
+"""Steps in which the platoon's first vehicle has nobody ahead."""
 
 Array = NDArray[np.float64]
 
@@ -48,6 +50,8 @@ def largest_difference(step: DriverStep, graph: bytes) -> float:
             np.concatenate([[(leader - was) / step.dt], acceleration[:-1]]),
             np.concatenate([[ahead], position[:-1]]) - LENGTH_M - position,
         ]
+        if number in FREE:
+            values[-1][0] = math.inf
         noise = torch.randn((VEHICLES, step.noise_width), generator=generator, dtype=torch.float64)
         given = dict(zip(SIGNALS, values, strict=True))
         for name, value in state._asdict().items():

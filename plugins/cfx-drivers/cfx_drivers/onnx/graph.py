@@ -22,7 +22,7 @@ SIGNALS = {
     "ego_acceleration": ("m/s2", "its acceleration over the last step, (v(t) - v(t - dt)) / dt"),
     "leader_speed": ("m/s", "speed of the vehicle ahead"),
     "leader_acceleration": ("m/s2", "acceleration of the vehicle ahead"),
-    "gap": ("m", "to the vehicle ahead, bumper to bumper"),
+    "gap": ("m", "to the vehicle ahead, bumper to bumper; infinity: nobody is ahead"),
 }
 NOISE = ("1", "standard normal, new in each step; a driver whose window begins draws of it")
 STATE = {

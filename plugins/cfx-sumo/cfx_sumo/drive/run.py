@@ -15,7 +15,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO, Unpack
 from xml.etree import ElementTree
@@ -91,8 +91,10 @@ class Tally:
         speeds: of all steps, m/s.
         accelerations: of all steps, m/s2.
         time_gaps: of the steps behind a leader faster than walking, s.
-        collisions: of those that SUMO reported, the ones with contact (`Collision.contact`).
-        below_min_gap: the others: the gap was below minGap, and nobody was touched.
+        collisions: of those that SUMO reported, the ones with contact (`Collision.contact`) of a
+            vehicle and the one ahead of it.
+        below_min_gap: those in which the gap was below minGap, and nobody was touched.
+        crossings: those of vehicles whose paths cross at a junction.
         teleports: vehicles that SUMO reported; a vehicle may teleport more than once.
     """
 
@@ -109,6 +111,7 @@ class Tally:
     time_gaps: Histogram = field(default_factory=lambda: Histogram(0.0, 30.0, 0.05))
     collisions: int = 0
     below_min_gap: int = 0
+    crossings: int = 0
     teleports: int = 0
 
 
@@ -125,6 +128,7 @@ class Collision:
         lane: of the collider.
         position: of the collider's front on it, m.
         gap: the smallest, from bumper to bumper, m; None: not known, as where paths cross.
+        crossing: whether their paths cross at a junction; otherwise one is behind the other.
     """
 
     time: float
@@ -134,6 +138,7 @@ class Collision:
     lane: str
     position: float
     gap: float | None
+    crossing: bool = False
 
     @property
     def contact(self) -> bool:
@@ -142,6 +147,11 @@ class Collision:
 
     def __str__(self) -> str:
         """Returns who, where and when on one line."""
+        if self.crossing:
+            return (
+                f"{self.time:.2f} s: {self.collider} and {self.victim}, whose paths cross, on"
+                f" {self.lane} at {self.position:.1f} m"
+            )
         what = "contact"
         if not self.contact:
             what = "below minGap"
@@ -175,6 +185,8 @@ class ScenarioRun:
         expected: for each vType, what error of speed to expect of its policy, in words; "" where
             that is not known.
         collisions: that SUMO reported of driven vehicles, in their order.
+        crossings_of_sumo: how many of vehicles whose paths cross SUMO has in the same scenario
+            where its own models drive all; None where there was nothing to compare with it.
     """
 
     tallies: Mapping[str, Tally]
@@ -189,6 +201,7 @@ class ScenarioRun:
     recorded: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)
     expected: Mapping[str, str] = field(default_factory=dict)
     collisions: Sequence[Collision] = ()
+    crossings_of_sumo: int | None = None
 
     @property
     def real_time(self) -> float:
@@ -235,21 +248,59 @@ def run_scenario(
     """
     require_sumo()
     with ExitStack() as stack:
-        path, actor = _prepared(scenario, end, stack)
+        path, make_actor = _prepared(scenario, end, stack)
         seed = options.get("seed")
         options["seed"] = seed or 0
         fleet = Fleet.load(runs, **options)
         if step is None and not _sets_step(path, sumo_options):
             step = min(driver.policy.dt for driver in fleet.drivers.values())
         command = command_line(path, sumo_options, step=step, seed=seed, gui=gui)
-        connection = stack.enter_context(started(path, command, gui))
-        rows = _Rows.opened(stack, output, fleet) if output is not None else None
-        try:
-            return _Run(connection, fleet, path, rows, actor, _name(scenario)).go(end)
-        except OSError as error:
-            raise OutputError(
-                f"{output} cannot be written ({error.strerror or error}); name another --output"
-            ) from error
+        with started(path, command, gui) as connection:
+            rows = _Rows.opened(stack, output, fleet) if output is not None else None
+            try:
+                run = _Run(connection, fleet, path, rows, make_actor(), _name(scenario)).go(end)
+            except OSError as error:
+                raise OutputError(
+                    f"{output} cannot be written ({error.strerror or error}); name another --output"
+                ) from error
+        if not any(collision.crossing for collision in run.collisions):
+            return run
+        command = command_line(path, sumo_options, step=step, seed=seed)
+        with started(path, command, gui=False) as connection:
+            crossings = _crossings_of_sumo(connection, fleet, run.steps, make_actor())
+        return replace(run, crossings_of_sumo=crossings)
+
+
+def _crossings_of_sumo(sumo: Any, fleet: Fleet, steps: int, actor: Actor | None) -> int:
+    """Returns how many collisions of crossing paths a scenario has without drivers of cfx.
+
+    Args:
+        sumo: that has just started the scenario.
+        fleet: whose vTypes count.
+        steps: of the simulation.
+        actor: acts on the simulation besides.
+    """
+    total = 0
+    before: set[tuple[str, str]] = set()
+    with Task("The same without cfx's drivers", steps) as task:
+        for _ in range(steps):
+            if actor is not None:
+                actor(sumo)
+            sumo.simulationStep()
+            touching = set()
+            for found in sumo.simulation.getCollisions():
+                driven = fleet.has_type(found.colliderType) or fleet.has_type(found.victimType)
+                if driven and _is_crossing(found):
+                    touching.add((found.collider, found.victim))
+            total += len(touching - before)
+            before = touching
+            task.advance()
+    return total
+
+
+def _is_crossing(found: Any) -> bool:
+    """Says whether a collision that SUMO reports is one of crossing paths."""
+    return "junction" in found.type
 
 
 def _name(scenario: Path | str) -> str:
@@ -259,22 +310,23 @@ def _name(scenario: Path | str) -> str:
 
 def _prepared(
     scenario: Path | str, end: float | None, stack: ExitStack
-) -> tuple[Path, Actor | None]:
-    """Returns SUMO's configuration, and what acts on the simulation besides the drivers."""
+) -> tuple[Path, Callable[[], Actor | None]]:
+    """Returns SUMO's configuration, and what makes who acts on the simulation besides drivers."""
     shipped = SCENARIOS.get(str(scenario))
     path = Path(scenario)
     if shipped is not None and not path.exists():
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-")))
-        actor = None
-        if shipped.make_actor is not None:
-            actor = shipped.make_actor()
-        return shipped.write(folder, end), actor
+        return shipped.write(folder, end), shipped.make_actor or _nobody
     if not path.is_file():
         raise DataError(
             f"{path} is not there; name SUMO's configuration of the scenario (.sumocfg), or a"
             f" scenario that comes with cfx: {', '.join((*SCENARIOS, 'stress'))}"
         )
-    return path, None
+    return path, _nobody
+
+
+def _nobody() -> None:
+    """Makes nobody who acts on a simulation besides its drivers."""
 
 
 @contextmanager
@@ -307,6 +359,8 @@ def started(scenario: Path, command: Sequence[str], gui: bool) -> Iterator[Any]:
 
 
 _QUIET = "LIBSUMO_AS_TRACI"
+
+_CHECK_JUNCTIONS = "--collision.check-junctions"
 
 
 def _in_process(command: Sequence[str]) -> Any:
@@ -398,8 +452,11 @@ def command_line(
     if gui:
         command[0] = _gui_program()
         command += ["--start", "--quit-on-end", "--delay", "100"]
-    for name in ("--no-step-log", "--duration-log.disable", "--no-warnings"):
-        if name not in options:
+    # SUMO does not look for collisions at junctions unless it is told to.
+    switches = ("--no-step-log", "--duration-log.disable", "--no-warnings", _CHECK_JUNCTIONS)
+    given = {option.partition("=")[0] for option in options}
+    for name in switches:
+        if name not in given:
             command += [name, "true"]
     if step is not None:
         command += ["--step-length", f"{step:g}"]
@@ -500,7 +557,9 @@ class _Run:
                     f" ({self._steps * dt:g} s); give it a flow, or a later --end"
                 )
         for collision in self._collisions:
-            if collision.contact:
+            if collision.crossing:
+                self._tallies[collision.kind].crossings += 1
+            elif collision.contact:
                 self._tallies[collision.kind].collisions += 1
             else:
                 self._tallies[collision.kind].below_min_gap += 1
@@ -610,7 +669,8 @@ class _Run:
             known, before = self._touching.get(key), self._gap_before(*key)
             if known is None:
                 gap = self._gap(found, before, dt)
-                known = Collision(now, kind, *key, found.lane, found.pos, gap)
+                crossing = _is_crossing(found)
+                known = Collision(now, kind, *key, found.lane, found.pos, gap, crossing)
                 self._collisions.append(known)
             elif known.gap is not None and before is not None:
                 # SUMO goes on to report the speeds of the first step.
@@ -632,7 +692,7 @@ class _Run:
         policy drives, the places of both on the lane.
         """
         if found.type != "collision":
-            return None  # their paths crossed
+            return None  # their paths cross, or they meet head-on
         if before is not None:
             return float(before + (found.victimSpeed - found.colliderSpeed) * dt)
         vehicle = self._sumo.vehicle
@@ -741,6 +801,12 @@ def report(run: ScenarioRun) -> None:
             "SUMO takes a gap below minGap for a collision, and teleports the vehicle unless the"
             " scenario says otherwise; -- --collision.mingap-factor 0 leaves contact alone"
         )
+    if run.crossings_of_sumo is not None:
+        crossings = sum(tally.crossings for tally in run.tallies.values())
+        print(
+            f"Collisions of vehicles whose paths cross at a junction: {crossings}; where SUMO's own"
+            f" models drive all of them in the same scenario: {run.crossings_of_sumo}"
+        )
     for name, words in run.expected.items():
         if words:
             print(f"{name}: {words}")
@@ -762,6 +828,7 @@ def _what_happened(run: ScenarioRun) -> Table:
         "lane changes",
         "collisions",
         "below minGap",
+        "crossing paths",
         "teleports",
     )
     for name, tally in run.tallies.items():
@@ -773,6 +840,7 @@ def _what_happened(run: ScenarioRun) -> Table:
             str(tally.lane_changes),
             str(tally.collisions),
             str(tally.below_min_gap),
+            str(tally.crossings),
             str(tally.teleports),
         )
     return table

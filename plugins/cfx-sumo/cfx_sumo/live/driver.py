@@ -49,6 +49,7 @@ from cfx.plugin import (
 from cfx.plugin import load_agent as load_checkpoint
 from cfx_sumo.live.braking import hardest_braking
 from cfx_sumo.live.clock import Clock
+from cfx_sumo.live.control import VehicleControl
 from cfx_sumo.live.draws import standard_normal
 from cfx_sumo.live.orders import set_speeds
 from cfx_sumo.live.saved import DriverRecord, read_state, write_state
@@ -173,8 +174,13 @@ class Driver:
 
     The model's limits of acceleration hold always (`model.limits`). Where SUMO bounds braking too
     (bit 4 of the speed mode), a vehicle brakes comfortably at most, unless keeping its
-    vType's `minGap` needs more: see `needed_deceleration`. SUMO's `decel` of the vehicle is raised
-    to that meanwhile.
+    vType's `minGap` needs more: see `needed_deceleration`. Then it brakes as hard as that, by its
+    vType's `emergencyDecel` at most, and SUMO's `decel` of the vehicle is raised until it can stop
+    with less at the next light, junction or stop (`VehicleControl`).
+
+    A vehicle that `step` is not given any more is SUMO's again, as after `release`: at once in a
+    program that steps all its vehicles in one call, at the next instant in one that makes several
+    calls.
 
     A driver holds the state of one simulation. Where time goes back, all its vehicles begin anew;
     several simulations at once need a driver each.
@@ -214,7 +220,6 @@ class Driver:
             )
         self.policy = policy
         self.look_ahead = look_ahead
-        self.speed_mode = speed_mode
         self.source = source
         self.model = model or cast(DrivingModel, create("model", policy.model_node))
         if self.model.needs_simulator:
@@ -237,8 +242,9 @@ class Driver:
         self._assigned: dict[str, int] = {}
         self._bases: dict[str, list[float]] = {}
         self._driver_features: dict[str, list[float]] = {}
-        self._speed_modes: dict[str, int] = {}
-        self._raised: dict[str, tuple[str, float]] = {}
+        self._control = VehicleControl(speed_mode)
+        self._given: set[str] = set()
+        self._calls = 0
         self.counts = DriveCounts()
         self._leaders: dict[str, str] = {}
         self._slots: dict[str, int] = {}
@@ -391,13 +397,18 @@ class Driver:
             begun = self._begun(torch.tensor([slot]))
             self._store.state[slot] = begun.state[begun.network, begun.place][0]
 
+    @property
+    def speed_mode(self) -> int:
+        """SUMO's bit set of `vehicle.setSpeedMode` while a vehicle is driven."""
+        return self._control.speed_mode
+
     def drives(self, vehicle: str) -> bool:
         """Says whether the model drives a vehicle now; a watched vehicle is not driven."""
-        return vehicle in self._speed_modes
+        return self._control.drives(vehicle)
 
     def follows(self, vehicle: str) -> bool:
         """Says whether the model drives a vehicle now behind a leader."""
-        return vehicle in self._speed_modes and vehicle in self._leaders
+        return self.drives(vehicle) and vehicle in self._leaders
 
     def outside_in_words(self) -> str:
         """Returns how much was driven outside what the policy has learned, in words; or ""."""
@@ -475,8 +486,10 @@ class Driver:
         clock = self._clock_of(connection)
         if now < self._now:
             self._forget_all()
+        is_new = now != self._now
         self._now = now
         self._forget_departed(connection, now)
+        self._let_go(connection, names if drive else [], names, is_new=is_new)
         slots = self._asked_for(connection, names, now)
         times = self._store.time[slots]
         early = now - times < clock.period - 0.5 * clock.dt
@@ -514,6 +527,7 @@ class Driver:
         """Lets the model take its steps until the next look, and tells SUMO where they lead."""
         names = [*view.following, *view.alone]
         if not names:
+            self._control.bound_braking(connection, names, {})
             return
         count = len(view.following)
         store = self._store
@@ -551,12 +565,9 @@ class Driver:
             told = first + store.ramp[slots] * clock.dt
         store.told[slots] = told
         brakes_hard = {}
-        if self._raised:
-            brakes_hard = dict.fromkeys(self._raised.keys() & names, 0.0)
         for index in hardest.nonzero().flatten().tolist():
             brakes_hard[names[index]] = float(hardest[index])
-        for name, own in brakes_hard.items():
-            self._set_decel(connection, name, own)
+        self._control.bound_braking(connection, names, brakes_hard)
         set_speeds(connection, names, told.numpy())
 
     def _watch(
@@ -600,7 +611,8 @@ class Driver:
         """Writes what is known of all vehicles, for a simulation that goes on from here.
 
         SUMO's own state of the same instant (`simulation.saveState`) belongs to it; SUMO writes it
-        exactly with `--save-state.precision 17`.
+        exactly with `--save-state.precision 17 --save-state.rng true`. Without its random numbers
+        SUMO's own drivers go on differently, by their `sigma`.
 
         Args:
             path: of the file.
@@ -634,8 +646,9 @@ class Driver:
             "policy": self._identity(),
             "vehicles": names,
             "leaders": self._leaders,
-            "speed_modes": self._speed_modes,
-            "raised": self._raised,
+            "control": self._control.described(),
+            "given": sorted(self._given),
+            "calls": self._calls,
             "assigned": self._assigned,
             "bases": self._bases,
             "driver_features": self._driver_features,
@@ -678,15 +691,14 @@ class Driver:
         slots = self._places(names)
         self._store.put_columns(slots, rows)
         self._leaders = dict(described["leaders"])
-        self._speed_modes = dict(described["speed_modes"])
-        self._raised = {name: (kind, own) for name, (kind, own) in described["raised"].items()}
+        self._given = set(described["given"])
+        self._calls = described["calls"]
         self._assigned = dict(described["assigned"])
         self._bases = dict(described["bases"])
         self._driver_features = dict(described["driver_features"])
-        told = self._store.told.tolist()
-        for name in self._speed_modes:  # SUMO's state keeps nothing of TraCI's
-            connection.vehicle.setSpeedMode(name, self.speed_mode)
-            connection.vehicle.setSpeed(name, told[self._slots[name]])
+        self._control.go_on(connection, described["control"])
+        driven = list(self._control.driven)
+        set_speeds(connection, driven, self._store.told[self._slots_of(driven)].numpy())
 
     def _identity(self) -> list[object]:
         """Returns what policies must share to go on from one another's state."""
@@ -704,9 +716,13 @@ class Driver:
 
     def forget(self, vehicle: str) -> None:
         """Drops all that is known of a vehicle; SUMO keeps the last speed that it was given."""
-        self._speed_modes.pop(vehicle, None)
+        self._control.forget(vehicle)
+        self._drop(vehicle)
+
+    def _drop(self, vehicle: str) -> None:
+        """Drops what was seen of a vehicle."""
         self._leaders.pop(vehicle, None)
-        self._raised.pop(vehicle, None)
+        self._given.discard(vehicle)
         self._asked = []
         slot = self._slots.pop(vehicle, None)
         if slot is not None:
@@ -718,14 +734,45 @@ class Driver:
             self.forget(vehicle)
         self._swept = math.nan
         self._clock = None
+        self._given, self._calls = set(), 0
 
     def release(self, connection: Connection, vehicle: str) -> None:
-        """Hands a vehicle back to SUMO's own model and drops what is known of it."""
-        if vehicle in self._speed_modes:
-            connection.vehicle.setSpeed(vehicle, -1)
-            connection.vehicle.setSpeedMode(vehicle, self._speed_modes[vehicle])
-            self._set_decel(connection, vehicle, 0.0)
-        self.forget(vehicle)
+        """Hands a vehicle back to SUMO's own model and drops what is known of it.
+
+        Where it brakes hard for a light, a stop or a junction, SUMO's `decel` of it stays raised
+        until later steps of this driver can lower it.
+        """
+        self._control.give_back(connection, vehicle)
+        self._drop(vehicle)
+
+    def _let_go(
+        self, connection: Connection, given: list[str], names: list[str], *, is_new: bool
+    ) -> None:
+        """Hands vehicles back to SUMO that are driven and not given any more.
+
+        That is at once for a program that steps all its vehicles in one call. One that makes
+        several calls at an instant may give a vehicle in a later one: then it is when the next
+        instant comes.
+
+        Args:
+            connection: to the simulation.
+            given: vehicles that this call drives.
+            names: vehicles that it names, to drive or to watch them.
+            is_new: whether this is the first call at this instant.
+        """
+        if not is_new:
+            self._calls += 1
+            self._given.update(given)
+            return
+        before, self._given = self._given, set(given)
+        if self._calls == 1:
+            before = self._given
+        self._calls = 1
+        if len(self._control.driven) == len(before) and given == self._asked:
+            return
+        self._forget_gone(connection, names, self._now)
+        for name in self._control.driven - (before | self._given):
+            self.release(connection, name)
 
     def _number(self, network: str) -> int:
         names = self.policy.names
@@ -927,20 +974,8 @@ class Driver:
             self._leaders.pop(name, None)
         self._begin(new, beginning)
         store.free[new] = True
-        store.parameters[new] = self._free_parameters(new)
-
-    def _free_parameters(self, slots: Tensor) -> Tensor:
-        """Returns the parameters of vehicles without a leader, `(D, n)`, SI units.
-
-        The policy has not learned to choose any. They are those to which it fades outside what it
-        has learned: its base or its pooled parameters; or else the model's defaults.
-        """
-        policy, network = self.policy, self._store.network[slots]
-        if policy.base is not None:
-            return self._store.base[slots]
-        if policy.population is not None:
-            return policy.head.completed(policy.population[network].double())
-        return policy.space.defaults().double().expand(len(slots), -1)
+        base = None if self.policy.base is None else store.base[new]
+        store.parameters[new] = self.policy.free_road_parameters(store.network[new], base)
 
     def _begun(self, slots: Tensor) -> AgentState:
         """Returns the state of vehicles before their first window."""
@@ -966,8 +1001,7 @@ class Driver:
             store.driven[slot] = True
             store.steps[slot] = 0
             store.memory[slot] = self._driven.initial_memory(seen.speed[index])
-            self._speed_modes.setdefault(name, connection.vehicle.getSpeedMode(name))
-            connection.vehicle.setSpeedMode(name, self.speed_mode)
+            self._control.take(connection, name)
 
     def _choose(self, following: Tensor, names: list[str], due: Tensor, now: float) -> None:
         """Lets the policy choose the parameters of those followers whose window begins."""
@@ -1035,6 +1069,10 @@ class Driver:
         limits = self.model.limits
         if limits is not None and self.speed_mode & _BOUNDS_BRAKING:
             hardest = hardest_braking(seen, limits)
+            beyond = hardest > limits.comfortable_deceleration
+            for index in beyond.nonzero().flatten().tolist():
+                emergency = connection.vehicle.getEmergencyDecel(names[index])
+                hardest[index] = min(float(hardest[index]), emergency)
             speed = torch.maximum(speed, (seen.speed - hardest * dt).clamp(min=0.0))
             bound = torch.where(hardest > limits.comfortable_deceleration, hardest, 0.0)
         limit = seen.allowed.clone()
@@ -1043,25 +1081,6 @@ class Driver:
             slowest = seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
             limit[index] = max(limit[index], slowest)
         return torch.minimum(speed, limit), bound
-
-    def _set_decel(self, connection: Connection, name: str, bound: float) -> None:
-        """Lets SUMO brake a vehicle by `bound`, m/s2, where that is more than its own `decel`.
-
-        SUMO makes a vType for this vehicle then; it has its own one again as soon as it can.
-        """
-        if bound == 0.0 and name not in self._raised:
-            return
-        vehicle = connection.vehicle
-        kind, own = self._raised.get(name) or (vehicle.getTypeID(name), vehicle.getDecel(name))
-        if bound > own:
-            vehicle.setDecel(name, bound)
-            self._raised[name] = kind, own
-        elif name in self._raised:
-            del self._raised[name]
-            if vehicle.getTypeID(name) == kind:
-                vehicle.setDecel(name, own)  # it had a vType of its own before
-            else:
-                vehicle.setType(name, kind)
 
 
 def _load_policy(run: str | Path) -> Agent:

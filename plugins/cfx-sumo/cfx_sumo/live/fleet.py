@@ -94,8 +94,7 @@ class Fleet:
         for vehicle in connection.vehicle.getIDList():
             known = self._type_of.get(vehicle)
             if known is None or vehicle in departed:
-                vtype = connection.vehicle.getTypeID(vehicle).partition("@")[0]
-                known = self._member_of.get(vtype, vtype)
+                known = self._name_of(connection.vehicle.getTypeID(vehicle))
             types[vehicle] = known
         self._type_of = types
         vehicles: dict[int, list[str]] = {id(driver): [] for driver in self._each_driver()}
@@ -109,6 +108,15 @@ class Fleet:
         ]
         while turns:
             turns = [turn for turn in turns if next(turn, _DONE) is not _DONE]
+
+    def has_type(self, vtype: str) -> bool:
+        """Says whether the fleet drives vehicles of a vType of SUMO's."""
+        return self._name_of(vtype) in self.drivers
+
+    def _name_of(self, vtype: str) -> str:
+        """Returns the name under which a vType of SUMO's counts."""
+        shared = vtype.partition("@")[0]
+        return self._member_of.get(shared, shared)
 
     def save_state(self, path: str | Path) -> None:
         """Writes what all drivers know, as `Driver.save_state` does.

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.errors import SumoError
+from cfx.plugin import FREE_ROAD_M
 from cfx_sumo.live.bridge import Read, bridge_of
 
 Connection = Any
@@ -74,9 +75,6 @@ its own users need."""
 
 _SUBSCRIBED = (_SPEED, _ACCELERATION, _ALLOWED_SPEED, _MIN_GAP)
 """What is subscribed to, besides the leader."""
-
-_FARTHEST = 1e6
-"""m: no gap is larger."""
 
 _ANOTHER, _NOBODY = -1, -2
 """Rows of a leader who is not among the vehicles that are read, and of none."""
@@ -196,7 +194,7 @@ def _view(
     ahead, rows = columns.ahead, columns.rows
     raw, speed, acceleration, min_gap, allowed = columns.values
     gap = raw + min_gap
-    follows = (rows != _NOBODY) & (np.abs(raw) <= _FARTHEST) & (gap <= look_ahead)
+    follows = (rows != _NOBODY) & (np.abs(raw) <= FREE_ROAD_M) & (gap <= look_ahead)
     leader_speed = np.where(follows, speed.take(rows, mode="clip"), speed)
     leader_acceleration = np.where(follows, acceleration.take(rows, mode="clip"), 0.0)
     for row in (follows & (rows < 0)).nonzero()[0].tolist():
@@ -204,7 +202,7 @@ def _view(
     signals = [
         speed,
         acceleration,
-        np.where(follows, gap, _FARTHEST),
+        np.where(follows, gap, FREE_ROAD_M),
         leader_speed,
         leader_acceleration,
         allowed,
