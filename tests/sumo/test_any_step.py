@@ -121,7 +121,7 @@ def test_acceleration_is_held_between_the_models_steps() -> None:
 def test_history_holds_what_the_leader_did_within_a_long_step() -> None:
     driver = Driver(adaptive({"name": "idm"}, length=8), speed_mode=0)
     Motion(0.5).go(lambda road: driver.step(road, "car"))
-    history = driver._store.history[driver._slots["car"]]
+    history = driver._vehicles.table.history[driver._vehicles.row("car")]
     speeds = history[History._fields.index("leader_speed")].tolist()
     # The frame at 30 s is followed by four that are expected; before it are those of a past step.
     end = len(speeds) - 5

@@ -216,7 +216,7 @@ def test_a_vehicle_that_leaves_is_forgotten_and_its_place_is_used_again() -> Non
         road.cars[f"v{k + 20}"] = Car(leader="lead")
         driver.step(road, [name for name in road.cars if name != "lead"])
         assert set(driver.vehicles) == set(road.cars) - {"lead"}
-    assert len(driver._store.time) <= 64
+    assert len(driver._vehicles.table.time) <= 64
     assert driver.parameters("v3") == {}
 
 

@@ -326,6 +326,40 @@ def test_crossing_paths_are_counted_beside_those_of_sumo_alone(tmp_path: Path, l
     assert of_sumo == 0
 
 
+OUT_OF_ORDER = f"""
+import sys
+sys.modules["pyarrow"] = None
+import json
+from pathlib import Path
+from cfx.errors import SumoError
+from cfx_sumo.drive.run import run_scenario
+Path("late.rou.xml").write_text('''<routes><vType id="car"/> <vType id="bus"/>
+  <vType id="tram" vClass="tram"/> <route id="m" edges="1001 1002 1003"/>
+  <vehicle id="first" type="car" route="m" depart="1"/>
+  <vehicle id="railless" type="tram" route="m" depart="1"/>
+  <flow id="early" type="bus" route="m" begin="0" end="9" period="3"/></routes>''')
+Path("late.sumocfg").write_text('''<configuration><input><net-file value="{SHIPPED}"/>
+  <route-files value="late.rou.xml"/></input><processing><ignore-route-errors value="true"/>
+  </processing></configuration>''')
+run = run_scenario(Path("late.sumocfg"), {{"car": "cfx://i80-idm"}}, end=2.0)
+try:
+    run_scenario(Path("late.sumocfg"), {{"bus": "cfx://i80-idm"}}, end=2.0,
+                 sumo_options=["--error-log", "own.txt"])
+except SumoError as error:
+    print(json.dumps([run.left_out, str(error), Path("own.txt").is_file()]))
+"""
+
+
+def test_what_sumo_leaves_out_of_a_scenario_is_said(tmp_path: Path, live: Forks) -> None:
+    """Also where the user has SUMO's warnings in a file of their own."""
+    sentences, error, is_kept = python(live, OUT_OF_ORDER, tmp_path)
+    assert "Route file should be sorted by departure time, ignoring 'early'!" in sentences
+    assert any("'railless' is not allowed to depart" in sentence for sentence in sentences)
+    assert "no vehicle of vType 'bus' was ever on the road" in error
+    assert f"SUMO left out {len(sentences)} of the scenario's vehicles" in error
+    assert is_kept
+
+
 def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
     tally = Tally(
         {"a", "b"},
@@ -361,6 +395,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
             Collision(4.5, "calm", "a", "y", ":n_0", 3.0, None, crossing=True),
         ],
         crossings_of_sumo=6,
+        left_out=[f"ignoring 'flow{number}'!" for number in range(12)],
     )
     report(run)
     out = capsys.readouterr().out
@@ -372,6 +407,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
     assert "3.10 s: a behind b on road_0 at 51.3 m: contact, gap -0.20 m" in out
     assert "4.00 s: b behind x on road_0 at 80.0 m: below minGap, gap 2.39 m" in out
     assert "4.50 s: a and y, whose paths cross, on :n_0 at 3.0 m" in out
+    assert "left out by SUMO: ignoring 'flow9'!\n... and 2 more vehicles and flows left out" in out
     assert "paths cross at a junction: 5; where SUMO's own models drive all" in out
     assert "in the same scenario: 6" in out
     assert "calm: RMSE of speed below 1.20 m/s" in out

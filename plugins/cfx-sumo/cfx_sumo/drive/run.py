@@ -25,6 +25,7 @@ import numpy as np
 from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.plugin import Task, atomic_write
 from cfx_sumo.drive.distributions import members_of
+from cfx_sumo.drive.left_out import left_out
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.live.driver import DriverOptions
@@ -44,7 +45,7 @@ _DECIMALS = 6
 """Of the output's numbers: micrometres, however far a vehicle is from the origin."""
 
 _LISTED = 10
-"""Collisions that the report lists."""
+"""Collisions, and vehicles left out, that the report lists."""
 
 
 class Histogram:
@@ -187,6 +188,7 @@ class ScenarioRun:
         collisions: that SUMO reported of driven vehicles, in their order.
         crossings_of_sumo: how many of vehicles whose paths cross SUMO has in the same scenario
             where its own models drive all; None where there was nothing to compare with it.
+        left_out: what SUMO says of the vehicles and flows of the scenario that it left out.
     """
 
     tallies: Mapping[str, Tally]
@@ -202,6 +204,7 @@ class ScenarioRun:
     expected: Mapping[str, str] = field(default_factory=dict)
     collisions: Sequence[Collision] = ()
     crossings_of_sumo: int | None = None
+    left_out: Sequence[str] = ()
 
     @property
     def real_time(self) -> float:
@@ -252,10 +255,14 @@ def run_scenario(
         seed = options.get("seed")
         options["seed"] = seed or 0
         fleet = Fleet.load(runs, **options)
-        if step is None and not _sets_step(path, sumo_options):
+        if step is None and not _is_set(path, sumo_options, "step-length"):
             step = min(driver.policy.dt for driver in fleet.drivers.values())
         command = command_line(path, sumo_options, step=step, seed=seed, gui=gui)
+        if not _is_set(path, sumo_options, "error-log"):
+            folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-"))
+            command += ["--error-log", str(Path(folder, "warnings.txt"))]
         with started(path, command, gui) as connection:
+            log = Path(connection.simulation.getOption("error-log"))
             rows = _Rows.opened(stack, output, fleet) if output is not None else None
             try:
                 run = _Run(connection, fleet, path, rows, make_actor(), _name(scenario)).go(end)
@@ -263,12 +270,29 @@ def run_scenario(
                 raise OutputError(
                     f"{output} cannot be written ({error.strerror or error}); name another --output"
                 ) from error
+        run = replace(run, left_out=left_out(log))
+        _check_on_the_road(run, path)
         if not any(collision.crossing for collision in run.collisions):
             return run
         command = command_line(path, sumo_options, step=step, seed=seed)
         with started(path, command, gui=False) as connection:
             crossings = _crossings_of_sumo(connection, fleet, run.steps, make_actor())
         return replace(run, crossings_of_sumo=crossings)
+
+
+def _check_on_the_road(run: ScenarioRun, scenario: Path) -> None:
+    """Checks that each driven vType had a vehicle."""
+    for name, tally in run.tallies.items():
+        if tally.vehicles:
+            continue
+        why = ""
+        if run.left_out:
+            number, first = len(run.left_out), run.left_out[0]
+            why = f". SUMO left out {number} of the scenario's vehicles and flows: {first}"
+        raise SumoError(
+            f"no vehicle of vType '{name}' was ever on the road in {scenario}"
+            f" ({run.steps * run.dt:g} s); give it a flow, or a later --end{why}"
+        )
 
 
 def _crossings_of_sumo(sumo: Any, fleet: Fleet, steps: int, actor: Actor | None) -> int:
@@ -420,13 +444,13 @@ def _gui_program() -> str:
     return program
 
 
-def _sets_step(scenario: Path, options: Sequence[str]) -> bool:
-    """Says whether SUMO's configuration or the user's own options say how long a step is."""
-    if any(option.partition("=")[0] == "--step-length" for option in options):
+def _is_set(scenario: Path, options: Sequence[str], name: str) -> bool:
+    """Says whether SUMO's configuration or the user's own options set one of SUMO's options."""
+    if any(option.partition("=")[0] == f"--{name}" for option in options):
         return True
     try:
         # S314: it is the user's own file, which SUMO reads next.
-        return next(ElementTree.parse(scenario).iter("step-length"), None) is not None  # noqa: S314
+        return next(ElementTree.parse(scenario).iter(name), None) is not None  # noqa: S314
     except ElementTree.ParseError:
         return True  # SUMO says what is wrong with it
 
@@ -550,12 +574,6 @@ class _Run:
                 self._after_step(dt)
                 task.advance()
         seconds = time.perf_counter() - began
-        for name, tally in self._tallies.items():
-            if not tally.vehicles:
-                raise SumoError(
-                    f"no vehicle of vType '{name}' was ever on the road in {self._scenario}"
-                    f" ({self._steps * dt:g} s); give it a flow, or a later --end"
-                )
         for collision in self._collisions:
             if collision.crossing:
                 self._tallies[collision.kind].crossings += 1
@@ -801,6 +819,10 @@ def report(run: ScenarioRun) -> None:
             "SUMO takes a gap below minGap for a collision, and teleports the vehicle unless the"
             " scenario says otherwise; -- --collision.mingap-factor 0 leaves contact alone"
         )
+    for sentence in run.left_out[:_LISTED]:
+        print(f"left out by SUMO: {sentence}")
+    if len(run.left_out) > _LISTED:
+        print(f"... and {len(run.left_out) - _LISTED} more vehicles and flows left out")
     if run.crossings_of_sumo is not None:
         crossings = sum(tally.crossings for tally in run.tallies.values())
         print(

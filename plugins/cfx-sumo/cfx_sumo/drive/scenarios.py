@@ -15,6 +15,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 from cfx_sumo.demo.motorway import SHIPPED as MOTORWAY
 
@@ -67,7 +68,7 @@ class Scenario(NamedTuple):
         if end is not None:
             last = end
         routes = folder / "scenario.rou.xml"
-        routes.write_text(self.routes, encoding="utf-8")
+        routes.write_text(in_order_of_departure(self.routes), encoding="utf-8")
         configuration = folder / "scenario.sumocfg"
         configuration.write_text(
             f'<configuration><input><net-file value="{self.network}"/>'
@@ -79,6 +80,23 @@ class Scenario(NamedTuple):
             encoding="utf-8",
         )
         return configuration
+
+
+def in_order_of_departure(routes: str) -> str:
+    """Sorts the vehicles and flows of a route file, after its types and routes.
+
+    SUMO reads a route file while it simulates, and ignores whatever departs before an entry above.
+
+    Args:
+        routes: the route file's text, with departures as plain numbers, s.
+    """
+    root = ElementTree.fromstring(routes)  # noqa: S314 - it is cfx's own text
+
+    def departure(entry: ElementTree.Element) -> float:
+        return float(entry.get("begin", entry.get("depart", "-inf")))
+
+    root[:] = sorted(root, key=departure)
+    return ElementTree.tostring(root, encoding="unicode")
 
 
 class Waves:

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
 from itertools import compress
 from pathlib import Path
 from typing import TypedDict, Unpack, cast
@@ -22,56 +21,28 @@ from typing import TypedDict, Unpack, cast
 import torch
 from torch import Tensor
 
-from cfx.errors import DataError, ParameterError, SumoError
-from cfx.plugin import (
-    ANY_DRIVER,
-    Agent,
-    AgentCore,
-    AgentState,
-    ConstantNetwork,
-    DirectHead,
-    DriverContext,
-    DrivingModel,
-    FixedPolicy,
-    Follower,
-    History,
-    Leader,
-    Scaler,
-    WindowSettings,
-    advance_vehicle,
-    at_limits,
-    create,
-    folder_of,
-    one_thread,
-    parse_json,
-    share_in_words,
-)
-from cfx.plugin import load_agent as load_checkpoint
-from cfx_sumo.live.braking import hardest_braking
+from cfx.errors import DataError, SumoError
+from cfx.plugin import ANY_DRIVER, Agent, DrivingModel, create, one_thread
+from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.control import VehicleControl
-from cfx_sumo.live.draws import standard_normal
+from cfx_sumo.live.counts import DriveCounts
+from cfx_sumo.live.histories import Histories, frame_of
+from cfx_sumo.live.motion import ModelSteps
 from cfx_sumo.live.orders import set_speeds
+from cfx_sumo.live.policies import check_model, constant_policy, load_policy
+from cfx_sumo.live.roster import Roster
 from cfx_sumo.live.saved import DriverRecord, read_state, write_state
 from cfx_sumo.live.surroundings import Connection, Seen, View, look
-from cfx_sumo.live.vehicles import VehicleTable
+from cfx_sumo.live.vehicles import KnownVehicles
+from cfx_sumo.live.windows import PolicyWindows
 
 _BOUNDS_BRAKING = 4
 """Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""
 
-_BLOCK = 1024
-"""Vehicles for which the networks answer at once: what more of them need exceeds the processor's
-caches, and takes twice as long for each."""
-
-_OBEYED_MPS = 1e-3
-"""A speed this close to what SUMO was told is what it was told."""
-
 Together = dict[tuple[int, int], dict[str, float]]
 """Speeds of vehicles, m/s, that drivers of one simulation expect within a step of it: by how many
 steps their models take in it, and which of these it is."""
-
-_WALKING_MPS = 1.5
-"""Speed below which a time gap means nothing."""
 
 OBEYS_ALL = 31
 """Speed mode with all of SUMO's checks: lights, stops, yielding, its safe gap."""
@@ -92,54 +63,6 @@ class DriverOptions(TypedDict, total=False):
     look_ahead: float
     speed_mode: int
     seed: int | None
-
-
-@dataclass
-class DriveCounts:
-    """What a driver did over all steps of all its vehicles.
-
-    Attributes:
-        steps: steps of the model behind a leader.
-        outside: those of them that began outside what the policy has learned from.
-        limited: those at a limit of acceleration.
-        beyond: in how many each signal alone was too low, then too high; None before the first.
-        free: steps of the model without a leader.
-        told: speeds that SUMO was told and whose result was seen.
-        changed: those of them that SUMO changed, by the checks that the speed mode leaves it.
-    """
-
-    steps: int = 0
-    free: int = 0
-    told: int = 0
-    changed: int = 0
-    outside: int = 0
-    limited: int = 0
-    beyond: Tensor | None = None
-
-    def add(self, score: Tensor, beyond: Tensor) -> None:
-        """Counts one step of D vehicles: scores `(D,)`, unusual signals `(D, 2 f)`."""
-        is_outside = score > 1.0
-        self.steps += len(score)
-        self.outside += int(is_outside.sum())
-        found = beyond[is_outside].sum(0)
-        self.beyond = found if self.beyond is None else self.beyond + found
-
-
-_LEADER_SPEED, _LEADER_ACCELERATION, _SPEED, _ACCELERATION, _GAP = range(len(History._fields))
-"""Rows of a history."""
-
-
-def _frame(seen: Seen) -> Tensor:
-    """Returns one frame of a history, `(D, 5)`."""
-    history = History(
-        seen.leader_speed, seen.leader_acceleration, seen.speed, seen.acceleration, seen.gap
-    )
-    return torch.stack(list(history), 1)
-
-
-def _is_limited(model: DrivingModel, before: Tensor, after: Tensor, dt: float) -> Tensor:
-    """Says which vehicles are at a limit of acceleration, bool `(D,)`, of speeds in m/s."""
-    return at_limits(model.limits, torch.stack([before, after], -1), dt)[:, 1]
 
 
 class Driver:
@@ -222,36 +145,17 @@ class Driver:
         self.look_ahead = look_ahead
         self.source = source
         self.model = model or cast(DrivingModel, create("model", policy.model_node))
-        if self.model.needs_simulator:
-            raise DataError(
-                f"{source} chooses parameters of model={policy.model_node['name']}, which SUMO"
-                " alone drives: they cannot be changed on the way; a live driver needs a model that"
-                " cfx has, such as krauss or w99"
-            )
-        if not self.model.brakes_within_bounds:
-            raise DataError(
-                f"{source}: its driving model has neither limits nor a brake cap, so it may brake"
-                " harder than a vehicle can; train it with model.limits as they are by default"
-                " (or model.variant=sumo) to drive live"
-            )
-        self._driven = policy.head.driven_model(self.model)
-        self._seed = seed
-        self._network = None
-        if network is not None:
-            self._network = self._number(network)
-        self._assigned: dict[str, int] = {}
-        self._bases: dict[str, list[float]] = {}
-        self._driver_features: dict[str, list[float]] = {}
-        self._control = VehicleControl(speed_mode)
-        self._given: set[str] = set()
-        self._calls = 0
+        check_model(self.model, policy.model_node["name"], source)
         self.counts = DriveCounts()
-        self._leaders: dict[str, str] = {}
-        self._slots: dict[str, int] = {}
-        self._unused: list[int] = []
-        self._asked: list[str] = []
-        self._asked_slots = torch.empty(0, dtype=torch.int64)
-        self._store = VehicleTable.empty(policy, self._driven, 0)
+        self._assignments = Assignments(policy, network, source)
+        self._vehicles = KnownVehicles(policy, policy.head.driven_model(self.model))
+        self._histories = Histories(self._vehicles)
+        self._windows = PolicyWindows(policy, self._vehicles, self._assignments, seed)
+        self._model_steps = ModelSteps(
+            policy, self.model, self._vehicles, bounds_braking=bool(speed_mode & _BOUNDS_BRAKING)
+        )
+        self._control = VehicleControl(speed_mode)
+        self._roster = Roster()
         self._swept = math.nan
         self._now = -math.inf
         self._clock: Clock | None = None
@@ -278,7 +182,7 @@ class Driver:
             DataError: there is no such policy, it has no such network, or it is one of another
                 model.
         """
-        policy = _load_policy(run)
+        policy = load_policy(run)
         name = policy.model_node["name"]
         if model is not None and name != model:
             raise DataError(
@@ -307,31 +211,13 @@ class Driver:
         Raises:
             ParameterError: the model has no such parameter.
         """
-        space = model.space
-        values = space.defaults()
-        for name, value in (parameters or {}).items():
-            if name not in space.names:
-                raise ParameterError(
-                    f"'{name}' is no tuned parameter of this model; it has {', '.join(space.names)}"
-                )
-            values[space.names.index(name)] = value
-        unit = space.to_unit(values)[None]
-        scaler = Scaler(unit.new_zeros((1, 1)), unit.new_ones((1, 1)))
-        policy = Agent(
-            core=AgentCore(FixedPolicy(), ConstantNetwork(unit), scaler, DirectHead(space)),
-            model_node={"name": type(model).__name__},
-            policy_node={"name": "fixed"},
-            windows=WindowSettings(),
-            dt=dt,
-            names=(ANY_DRIVER,),
-            population=values[None],
-        )
+        policy = constant_policy(model, parameters or {}, dt)
         return cls(policy, model=model, source="the constant driver", **options)
 
     @property
     def vehicles(self) -> tuple[str, ...]:
         """The vehicles that are driven or watched now."""
-        return tuple(self._slots)
+        return tuple(self._vehicles.names)
 
     def assign(
         self,
@@ -361,41 +247,13 @@ class Driver:
             ParameterError: `base` is not a value for each tuned parameter, or `driver_features` not
                 one for each driver feature of the policy.
         """
-        if network is not None:
-            self._assigned[vehicle] = self._number(network)
-        if base is not None:
-            self._bases[vehicle] = self._shrunk_base(base)
-        if driver_features is not None:
-            self._driver_features[vehicle] = self._ordered_features(driver_features)
-
-    def _shrunk_base(self, base: Mapping[str, float]) -> list[float]:
-        names = self.policy.model_space.names
-        if set(base) != set(names):
-            raise ParameterError(
-                f"base: give a value for each of {', '.join(names)}, and nothing else"
-            )
-        own = torch.tensor([[base[name] for name in names]], dtype=torch.float64)
-        shrunk: list[float] = self.policy.base_of(own)[0].tolist()
-        return shrunk
-
-    def _ordered_features(self, driver_features: Mapping[str, float]) -> list[float]:
-        known = self.policy.core.driver_features
-        if not known:
-            raise ParameterError(
-                "driver_features: this policy was trained to read none; leave them out"
-            )
-        if set(driver_features) != set(known):
-            raise ParameterError(
-                f"driver_features: give a value for each of {', '.join(known)}, and nothing else"
-            )
-        return [driver_features[name] for name in known]
+        self._assignments.assign(vehicle, network, base, driver_features)
 
     def renew(self, vehicle: str) -> None:
         """Lets the policy's memory of a vehicle begin anew; the frames of its last window stay."""
-        slot = self._slots.get(vehicle)
-        if slot is not None:
-            begun = self._begun(torch.tensor([slot]))
-            self._store.state[slot] = begun.state[begun.network, begun.place][0]
+        row = self._vehicles.row(vehicle)
+        if row is not None:
+            self._windows.renew(row)
 
     @property
     def speed_mode(self) -> int:
@@ -408,37 +266,30 @@ class Driver:
 
     def follows(self, vehicle: str) -> bool:
         """Says whether the model drives a vehicle now behind a leader."""
-        return self.drives(vehicle) and vehicle in self._leaders
+        return self.drives(vehicle) and vehicle in self._vehicles.leaders
 
     def outside_in_words(self) -> str:
         """Returns how much was driven outside what the policy has learned, in words; or ""."""
-        valid_range, counts = self.policy.valid_range, self.counts
-        if valid_range is None or counts.beyond is None:
-            return ""
-        return share_in_words(valid_range, counts.outside, counts.steps, counts.beyond)
+        return self.counts.outside_in_words(self.policy)
 
     def time_gaps(self, vehicles: Iterable[str]) -> Tensor:
         """Returns the time gaps of those that the model drives faster than walking, `(d,)`, s."""
-        slots = self._slots_of(name for name in vehicles if self.follows(name))
-        history = self._store.history[slots, :, -1]
-        gap = history[:, History._fields.index("gap")]
-        speed = history[:, History._fields.index("follower_speed")]
-        return (gap / speed)[speed > _WALKING_MPS]
+        following = (name for name in vehicles if self.follows(name))
+        return self._histories.time_gaps(self._vehicles.rows(following))
 
     def gap_to(self, vehicle: str, leader: str) -> float | None:
         """Returns the gap at the last step, bumper to bumper, m; None behind another or nobody."""
-        slot = self._slots.get(vehicle)
-        if slot is None or self._leaders.get(vehicle) != leader:
+        row = self._vehicles.row(vehicle)
+        if row is None or self._vehicles.leaders.get(vehicle) != leader:
             return None
-        return float(self._store.history[slot, History._fields.index("gap"), -1])
+        return self._histories.gap(row)
 
     def parameters(self, vehicle: str) -> dict[str, float]:
         """Returns the parameters of a vehicle now, SI units; empty if the policy drives it not."""
-        slot = self._slots.get(vehicle)
-        if slot is None or not bool(self._store.driven[slot]):
+        row, table = self._vehicles.row(vehicle), self._vehicles.table
+        if row is None or not bool(table.driven[row]):
             return {}
-        values = self._store.parameters[slot].tolist()
-        return dict(zip(self.policy.space.names, values, strict=True))
+        return dict(zip(self.policy.space.names, table.parameters[row].tolist(), strict=True))
 
     @torch.no_grad()
     @one_thread()
@@ -490,36 +341,36 @@ class Driver:
         self._now = now
         self._forget_departed(connection, now)
         self._let_go(connection, names if drive else [], names, is_new=is_new)
-        slots = self._asked_for(connection, names, now)
-        times = self._store.time[slots]
+        rows = self._rows_for(connection, names, now)
+        times = self._vehicles.table.time[rows]
         early = now - times < clock.period - 0.5 * clock.dt
         between: list[str] = []
         if bool(early.any()):
             between = list(compress(names, (early & (times != now)).tolist()))
-            names, slots = list(compress(names, (~early).tolist())), slots[~early]
+            names, rows = list(compress(names, (~early).tolist())), rows[~early]
         view = look(connection, names, self.look_ahead)
-        slots = slots[view.order]
+        rows = rows[view.order]
         if drive:
             self._hold(connection, between, now, clock)
-            yield from self._drive(connection, view, slots, now, clock, together)
+            yield from self._drive(connection, view, rows, now, clock, together)
         else:
-            self._watch(connection, view, slots, now, clock)
+            self._watch(connection, view, rows, now, clock)
 
     def _hold(self, connection: Connection, names: list[str], now: float, clock: Clock) -> None:
         """Lets vehicles go on as they accelerate, in the steps between two of the model."""
         driven = [name for name in names if self.drives(name)]
         if not driven:
             return
-        store, slots = self._store, self._slots_of(driven)
-        passed = now + clock.dt - store.time[slots]
-        store.told[slots] = store.start[slots] + store.ramp[slots] * passed
-        set_speeds(connection, driven, store.told[slots].numpy())
+        table, rows = self._vehicles.table, self._vehicles.rows(driven)
+        passed = now + clock.dt - table.time[rows]
+        table.told[rows] = table.start[rows] + table.ramp[rows] * passed
+        set_speeds(connection, driven, table.told[rows].numpy())
 
     def _drive(
         self,
         connection: Connection,
         view: View,
-        slots: Tensor,
+        rows: Tensor,
         now: float,
         clock: Clock,
         together: Together | None,
@@ -530,23 +381,23 @@ class Driver:
             self._control.bound_braking(connection, names, {})
             return
         count = len(view.following)
-        store = self._store
-        following = slots[:count]
-        self._count_changed(slots, view.seen, now, clock)
+        table, following = self._vehicles.table, rows[:count]
+        going = self._histories.goes_on(rows, now, clock)
+        self.counts.add_told(table.told[rows], view.seen.speed, going)
         seen = self._remember(following, view, now, clock)
-        self._begin_free(slots[count:], view.alone, now, clock)
-        self._take_over(connection, names, slots, seen, clock)
+        self._begin_free(rows[count:], view.alone, now, clock)
+        self._take_over(connection, names, rows, seen, clock)
         first, hardest = seen.speed, torch.zeros_like(seen.speed)
         for number in range(clock.substeps):
             if number > 0:
-                self._append(following, seen.rows(slice(count)))
-            due = store.steps[following] % self._stride(clock) == 0
-            self._choose(following, view.following, due, now + number * clock.step)
-            store.steps[following] += 1
-            self.counts.add(store.score[following], store.beyond[following])
-            speed, bound = self._speeds(connection, names, slots, seen, clock.step)
-            limited = _is_limited(self.model, seen.speed[:count], speed[:count], clock.step)
-            self.counts.limited += int(limited.sum())
+                self._histories.append(following, seen.rows(slice(count)))
+            self._windows.choose(following, view.following, now + number * clock.step, clock)
+            table.steps[following] += 1
+            self.counts.add(table.score[following], table.beyond[following])
+            speed, bound = self._model_steps.take(connection, names, rows, seen, clock.step)
+            self.counts.limited += self._model_steps.count_limited(
+                seen.speed[:count], speed[:count], clock.step
+            )
             hardest = torch.maximum(hardest, bound)
             leaders = None
             if clock.substeps > 1:
@@ -558,12 +409,12 @@ class Driver:
                 leaders = view.leader_speeds(speed, others)
             seen = seen.one_step_later(speed, clock.step, leaders)
         self.counts.free += clock.substeps * len(view.alone)
-        store.expected[slots] = _frame(seen)
-        store.start[slots], store.ramp[slots] = first, (seen.speed - first) / clock.period
+        table.expected[rows] = frame_of(seen)
+        table.start[rows], table.ramp[rows] = first, (seen.speed - first) / clock.period
         told = seen.speed
         if clock.held > 1:
-            told = first + store.ramp[slots] * clock.dt
-        store.told[slots] = told
+            told = first + table.ramp[rows] * clock.dt
+        table.told[rows] = told
         brakes_hard = {}
         for index in hardest.nonzero().flatten().tolist():
             brakes_hard[names[index]] = float(hardest[index])
@@ -571,7 +422,7 @@ class Driver:
         set_speeds(connection, names, told.numpy())
 
     def _watch(
-        self, connection: Connection, view: View, slots: Tensor, now: float, clock: Clock
+        self, connection: Connection, view: View, rows: Tensor, now: float, clock: Clock
     ) -> None:
         """Lets the policy see vehicles that somebody else drives."""
         for name in view.alone:
@@ -579,33 +430,66 @@ class Driver:
         if not view.following:
             return
         count = len(view.following)
-        slots = slots[:count]
-        seen = self._remember(slots, view, now, clock).rows(slice(count))
-        store = self._store
+        rows = rows[:count]
+        seen = self._remember(rows, view, now, clock).rows(slice(count))
+        table = self._vehicles.table
         for number in range(clock.substeps):
             if number > 0:
-                self._append(slots, seen)
-            self._observe(slots[store.steps[slots] % self._stride(clock) == 0])
-            store.steps[slots] += 1
+                self._histories.append(rows, seen)
+            self._windows.observe(rows, clock)
+            table.steps[rows] += 1
             speed = (seen.speed + seen.acceleration * clock.step).clamp(min=0.0)
             seen = seen.one_step_later(speed, clock.step)
-        store.expected[slots] = _frame(seen)
+        table.expected[rows] = frame_of(seen)
 
-    def _count_changed(self, slots: Tensor, seen: Seen, now: float, clock: Clock) -> None:
-        """Counts the vehicles that do not drive as SUMO was told."""
-        store = self._store
-        obliged = self._goes_on(slots, now, clock) & ~store.told[slots].isnan()
-        changed = (seen.speed - store.told[slots]).abs() > _OBEYED_MPS
-        self.counts.told += int(obliged.sum())
-        self.counts.changed += int((obliged & changed).sum())
+    def _remember(self, rows: Tensor, view: View, now: float, clock: Clock) -> Seen:
+        """Puts this instant into the histories of followers; begins those that are new.
 
-    def _stride(self, clock: Clock) -> int:
-        """Returns how many steps of the model a window of the policy takes."""
-        return clock.steps_in(self.policy.windows.stride * self.policy.dt)
+        Args:
+            rows: of the F followers, who stand first in the view.
+            view: all D vehicles.
+            now: s.
+            clock: of the simulation.
 
-    def _goes_on(self, slots: Tensor, now: float, clock: Clock) -> Tensor:
-        """Says which vehicles were looked at one period ago, bool `(D,)`."""
-        return (now - self._store.time[slots] - clock.period).abs() < 0.5 * clock.dt
+        Returns:
+            What all D vehicles do, with accelerations as over a step of the model.
+        """
+        seen, new = self._histories.remember(rows, view, now, clock)
+        if len(new) > 0:
+            self._windows.begin(rows[new], [view.following[number] for number in new.tolist()])
+        return seen
+
+    def _begin_free(self, rows: Tensor, names: list[str], now: float, clock: Clock) -> None:
+        """Begins vehicles that have no leader any more, or have just come."""
+        table = self._vehicles.table
+        stays_free = self._histories.goes_on(rows, now, clock) & table.free[rows]
+        new = (~stays_free).nonzero().flatten()
+        table.time[rows] = now
+        if len(new) == 0:
+            return
+        beginning = [names[number] for number in new.tolist()]
+        for name in beginning:
+            self._vehicles.leaders.pop(name, None)
+        self._windows.begin_free(rows[new], beginning)
+
+    def _take_over(
+        self, connection: Connection, names: list[str], rows: Tensor, seen: Seen, clock: Clock
+    ) -> None:
+        """Drives from here on the vehicles that begin, with a new window and memory."""
+        table = self._vehicles.table
+        for index in (~table.driven[rows]).nonzero().flatten().tolist():
+            name, row = names[index], int(rows[index])
+            acts = connection.vehicle.getActionStepLength(name)
+            if acts > clock.dt + 1e-6:
+                raise SumoError(
+                    f"vehicle '{name}' acts every {acts:g} s (actionStepLength) in steps of"
+                    f" {clock.dt:g} s, and a driver acts in each; leave actionStepLength out of its"
+                    f" vType, or start SUMO with --step-length {acts:g}"
+                )
+            table.driven[row] = True
+            table.steps[row] = 0
+            self._model_steps.begin(row, seen.speed[index])
+            self._control.take(connection, name)
 
     def save_state(self, path: str | Path) -> None:
         """Writes what is known of all vehicles, for a simulation that goes on from here.
@@ -640,20 +524,17 @@ class Driver:
 
     def record(self) -> DriverRecord:
         """Returns all that is known of the vehicles."""
-        names = list(self._slots)
+        names = list(self._vehicles.names)
         described = {
             "now": self._now,
             "policy": self._identity(),
             "vehicles": names,
-            "leaders": self._leaders,
+            "leaders": self._vehicles.leaders,
             "control": self._control.described(),
-            "given": sorted(self._given),
-            "calls": self._calls,
-            "assigned": self._assigned,
-            "bases": self._bases,
-            "driver_features": self._driver_features,
+            **self._roster.described(),
+            **self._assignments.described(),
         }
-        return DriverRecord(described, self._store.columns_of(self._slots_of(names)))
+        return DriverRecord(described, self._vehicles.table.columns_of(self._vehicles.rows(names)))
 
     def go_on(self, connection: Connection, record: DriverRecord, source: str) -> None:
         """Goes on from a record in a simulation that stands where it was made.
@@ -667,7 +548,7 @@ class Driver:
             DataError: the record is of another policy.
             SumoError: the simulation is at another time, or lacks one of the vehicles.
         """
-        described, rows = record
+        described, columns = record
         if described["policy"] != self._identity():
             raise DataError(
                 f"{source} is of a driver with another policy than {self.source}; load it with the"
@@ -688,17 +569,15 @@ class Driver:
             )
         self._forget_all()
         self._now = now
-        slots = self._places(names)
-        self._store.put_columns(slots, rows)
-        self._leaders = dict(described["leaders"])
-        self._given = set(described["given"])
-        self._calls = described["calls"]
-        self._assigned = dict(described["assigned"])
-        self._bases = dict(described["bases"])
-        self._driver_features = dict(described["driver_features"])
+        rows = self._vehicles.add(names)
+        self._vehicles.table.put_columns(rows, columns)
+        self._vehicles.leaders = dict(described["leaders"])
+        self._roster.go_on(described)
+        self._assignments.go_on(described)
         self._control.go_on(connection, described["control"])
         driven = list(self._control.driven)
-        set_speeds(connection, driven, self._store.told[self._slots_of(driven)].numpy())
+        told = self._vehicles.table.told[self._vehicles.rows(driven)]
+        set_speeds(connection, driven, told.numpy())
 
     def _identity(self) -> list[object]:
         """Returns what policies must share to go on from one another's state."""
@@ -710,10 +589,6 @@ class Driver:
             [windows.length, windows.stride, self.policy.dt],
         ]
 
-    def _slots_of(self, names: Iterable[str]) -> Tensor:
-        """Returns the rows of vehicles that are known, `(D,)` int64."""
-        return torch.tensor([self._slots[name] for name in names], dtype=torch.int64)
-
     def forget(self, vehicle: str) -> None:
         """Drops all that is known of a vehicle; SUMO keeps the last speed that it was given."""
         self._control.forget(vehicle)
@@ -721,12 +596,8 @@ class Driver:
 
     def _drop(self, vehicle: str) -> None:
         """Drops what was seen of a vehicle."""
-        self._leaders.pop(vehicle, None)
-        self._given.discard(vehicle)
-        self._asked = []
-        slot = self._slots.pop(vehicle, None)
-        if slot is not None:
-            self._unused.append(slot)
+        self._vehicles.drop(vehicle)
+        self._roster.forget(vehicle)
 
     def _forget_all(self) -> None:
         """Drops all vehicles: time went back, so this is another simulation or an earlier state."""
@@ -734,7 +605,7 @@ class Driver:
             self.forget(vehicle)
         self._swept = math.nan
         self._clock = None
-        self._given, self._calls = set(), 0
+        self._roster.clear()
 
     def release(self, connection: Connection, vehicle: str) -> None:
         """Hands a vehicle back to SUMO's own model and drops what is known of it.
@@ -761,46 +632,14 @@ class Driver:
             is_new: whether this is the first call at this instant.
         """
         if not is_new:
-            self._calls += 1
-            self._given.update(given)
+            self._roster.add(given)
             return
-        before, self._given = self._given, set(given)
-        if self._calls == 1:
-            before = self._given
-        self._calls = 1
-        if len(self._control.driven) == len(before) and given == self._asked:
+        before = self._roster.begin_instant(given)
+        if len(self._control.driven) == len(before) and self._vehicles.were_last(given):
             return
         self._forget_gone(connection, names, self._now)
-        for name in self._control.driven - (before | self._given):
+        for name in self._control.driven - (before | self._roster.given):
             self.release(connection, name)
-
-    def _number(self, network: str) -> int:
-        names = self.policy.names
-        if network in names:
-            return names.index(network)
-        if network == ANY_DRIVER and len(names) == 1:
-            return 0
-        if network == ANY_DRIVER:
-            raise DataError(
-                f"{self.source} has {len(names)} networks, each for one driver ({names[0]}, ...),"
-                " and none for unseen drivers; train with protocol.networks=all or"
-                " protocol=across_drivers, or name one of them: Driver.load(..., network=...), or"
-                f" --drivers TYPE={self.source}#{names[0]}"
-            )
-        listed = ", ".join(names[:5])
-        if len(names) > 5:
-            listed += ", ..."
-        raise DataError(f"{self.source} has no network '{network}'; it has {listed}")
-
-    def _network_of(self, vehicle: str) -> int:
-        """Returns the number of the network that drives a vehicle."""
-        number = self._assigned.get(vehicle, self._network)
-        if number is None:
-            raise DataError(
-                f"no network of {self.source} was assigned to vehicle '{vehicle}'; call"
-                " assign(vehicle, network) first"
-            )
-        return number
 
     def _clock_of(self, connection: Connection) -> Clock:
         """Returns how the model's steps fit into the simulation's.
@@ -821,20 +660,15 @@ class Driver:
     def _forget_departed(self, connection: Connection, now: float) -> None:
         """Drops vehicles that have just departed: another vehicle had that id a step ago."""
         for name in connection.simulation.getDepartedIDList():
-            slot = self._slots.get(name)
-            if slot is not None and float(self._store.time[slot]) != now:
+            row = self._vehicles.row(name)
+            if row is not None and float(self._vehicles.table.time[row]) != now:
                 self.forget(name)
 
-    def _asked_for(self, connection: Connection, names: list[str], now: float) -> Tensor:
-        """Returns the rows of vehicles, `(D,)` int64, and drops those that have left.
-
-        Mostly the same vehicles are asked for step after step: then nothing is looked up.
-        """
-        if names != self._asked or len(names) != len(self._slots):
+    def _rows_for(self, connection: Connection, names: list[str], now: float) -> Tensor:
+        """Returns the rows of vehicles, `(D,)` int64, and drops those that have left."""
+        if not self._vehicles.were_last(names) or len(names) != len(self._vehicles.names):
             self._forget_gone(connection, names, now)
-            self._asked_slots = self._places(names)
-            self._asked = list(names)
-        return self._asked_slots
+        return self._vehicles.rows_again(names)
 
     def _forget_gone(self, connection: Connection, names: list[str], now: float) -> None:
         """Drops vehicles that have left.
@@ -842,264 +676,9 @@ class Driver:
         That is looked for once an instant, and only if `names` leaves some vehicles unaccounted
         for.
         """
-        if self._swept == now or self._slots.keys() <= set(names):
+        if self._swept == now or self._vehicles.names <= set(names):
             return
         self._swept = now
-        for gone in self._slots.keys() - set(connection.vehicle.getIDList()):
+        for gone in self._vehicles.names - set(connection.vehicle.getIDList()):
             self.forget(gone)
-            self._assigned.pop(gone, None)
-            self._bases.pop(gone, None)
-            self._driver_features.pop(gone, None)
-
-    def _places(self, names: list[str]) -> Tensor:
-        """Returns the rows of vehicles, `(D,)` int64; a new vehicle gets one."""
-        for name in names:
-            if name in self._slots:
-                continue
-            if not self._unused:
-                taken = len(self._slots)
-                more = VehicleTable.empty(self.policy, self._driven, max(16, taken))
-                self._store = self._store.with_rows(more)
-                self._unused = list(range(taken, len(self._store.time)))
-            self._slots[name] = slot = self._unused.pop()
-            self._store.time[slot] = torch.nan  # it has no frame yet
-        return self._slots_of(names)
-
-    def _remember(self, slots: Tensor, view: View, now: float, clock: Clock) -> Seen:
-        """Puts this instant into the histories of followers; begins those that are new.
-
-        Args:
-            slots: of the F followers, who stand first in the view.
-            view: all D vehicles.
-            now: s.
-            clock: of the simulation.
-
-        Returns:
-            What all D vehicles do, with accelerations as over a step of the model.
-        """
-        store, count = self._store, len(slots)
-        going = self._goes_on(slots, now, clock) & ~store.free[slots]
-        frame = _frame(view.seen)
-        if clock.substeps > 1 or clock.held > 1:
-            frame[:count] = self._in_model_steps(slots, view, frame[:count], going, clock)
-        self._leaders.update(zip(view.following, view.leaders, strict=True))
-        seen = view.seen._replace(
-            acceleration=frame[:, _ACCELERATION], leader_acceleration=frame[:, _LEADER_ACCELERATION]
-        )
-        self._append(slots[going], seen.rows(slice(count)).rows(going))
-        store.time[slots] = now
-        if not bool(going.all()):
-            index = (~going).nonzero().flatten()
-            new = [view.following[number] for number in index.tolist()]
-            self._begin(slots[index], new)
-            store.history[slots[index]] = frame[index, :, None]
-            begun = self._begun(slots[index])
-            store.state[slots[index]] = begun.state[begun.network, begun.place]
-            store.latent[slots[index]] = begun.latent
-        return seen
-
-    def _in_model_steps(
-        self, slots: Tensor, view: View, frame: Tensor, going: Tensor, clock: Clock
-    ) -> Tensor:
-        """Returns frames `(F, 5)` with accelerations as they are over a step of the model.
-
-        SUMO's are over its own step. In a long one the frames of the model's steps were expected;
-        what happened instead is spread over them evenly. A leader that is new was not expected.
-        """
-        store, frame = self._store, frame.clone()
-        same = []
-        for name, leader in zip(view.following, view.leaders, strict=True):
-            same.append(self._leaders.get(name) == leader)
-        known = going & torch.tensor(same, dtype=torch.bool)
-        before = store.history[slots, :, -1]
-        if clock.held > 1:
-            mean = (frame - before) / clock.period
-            for speed, acceleration, is_known in (
-                (_SPEED, _ACCELERATION, going),
-                (_LEADER_SPEED, _LEADER_ACCELERATION, known),
-            ):
-                frame[:, acceleration] = torch.where(
-                    is_known, mean[:, speed], frame[:, acceleration]
-                )
-            return frame
-        error = frame - store.expected[slots]
-        error[:, _ACCELERATION] = error[:, _SPEED] / clock.dt
-        error[:, _LEADER_ACCELERATION] = error[:, _LEADER_SPEED] / clock.dt
-        own = torch.zeros(len(History._fields), dtype=torch.bool)
-        own[[_SPEED, _ACCELERATION]] = True
-        used = going[:, None] & (own | known[:, None])
-        error = torch.where(used, error, 0.0)
-        steps = min(clock.substeps - 1, store.history.shape[-1])
-        share = torch.arange(clock.substeps - steps, clock.substeps) / clock.substeps
-        spread = error[:, :, None] * share
-        for row in (_ACCELERATION, _LEADER_ACCELERATION):
-            spread[:, row] = error[:, row, None]
-        store.history[slots, :, -steps:] += spread
-        expected = store.expected[slots] + error
-        for row in (_ACCELERATION, _LEADER_ACCELERATION):
-            frame[:, row] = torch.where(used[:, row], expected[:, row], frame[:, row])
-        return frame
-
-    def _append(self, slots: Tensor, seen: Seen) -> None:
-        """Puts a frame of vehicles `(D,)` into their histories, in place of the oldest one."""
-        earlier = self._store.history[slots, :, 1:]
-        self._store.history[slots] = torch.cat([earlier, _frame(seen)[:, :, None]], -1)
-
-    def _begin(self, slots: Tensor, names: list[str]) -> None:
-        """Begins vehicles anew, with what is known of them from elsewhere."""
-        store = self._store
-        store.steps[slots] = 0
-        store.driven[slots] = store.free[slots] = False
-        store.told[slots] = torch.nan
-        store.network[slots] = torch.tensor([self._network_of(name) for name in names])
-        if self.policy.base is not None:
-            store.base[slots] = self.policy.base[store.network[slots]].to(store.base)
-        store.driver_features[slots] = torch.nan
-        for slot, name in zip(slots.tolist(), names, strict=True):
-            if name in self._bases:
-                store.base[slot] = torch.tensor(self._bases[name], dtype=torch.float64)
-            if name in self._driver_features:
-                features = torch.tensor(self._driver_features[name], dtype=torch.float64)
-                store.driver_features[slot] = features
-
-    def _begin_free(self, slots: Tensor, names: list[str], now: float, clock: Clock) -> None:
-        """Begins vehicles that have no leader any more, or have just come."""
-        store = self._store
-        index = (~(self._goes_on(slots, now, clock) & store.free[slots])).nonzero().flatten()
-        store.time[slots] = now
-        if len(index) == 0:
-            return
-        new, beginning = slots[index], [names[number] for number in index.tolist()]
-        for name in beginning:
-            self._leaders.pop(name, None)
-        self._begin(new, beginning)
-        store.free[new] = True
-        base = None if self.policy.base is None else store.base[new]
-        store.parameters[new] = self.policy.free_road_parameters(store.network[new], base)
-
-    def _begun(self, slots: Tensor) -> AgentState:
-        """Returns the state of vehicles before their first window."""
-        store = self._store
-        base = None if self.policy.base is None else store.base[slots]
-        context = DriverContext(base, store.driver_features[slots])
-        return self.policy.begin(store.network[slots], context)
-
-    def _take_over(
-        self, connection: Connection, names: list[str], slots: Tensor, seen: Seen, clock: Clock
-    ) -> None:
-        """Drives from here on the vehicles that begin, with a new window and memory."""
-        store = self._store
-        for index in (~store.driven[slots]).nonzero().flatten().tolist():
-            name, slot = names[index], int(slots[index])
-            acts = connection.vehicle.getActionStepLength(name)
-            if acts > clock.dt + 1e-6:
-                raise SumoError(
-                    f"vehicle '{name}' acts every {acts:g} s (actionStepLength) in steps of"
-                    f" {clock.dt:g} s, and a driver acts in each; leave actionStepLength out of its"
-                    f" vType, or start SUMO with --step-length {acts:g}"
-                )
-            store.driven[slot] = True
-            store.steps[slot] = 0
-            store.memory[slot] = self._driven.initial_memory(seen.speed[index])
-            self._control.take(connection, name)
-
-    def _choose(self, following: Tensor, names: list[str], due: Tensor, now: float) -> None:
-        """Lets the policy choose the parameters of those followers whose window begins."""
-        rows, seed = due.nonzero().flatten(), None
-        if self.policy.is_stochastic:
-            seed = self._seed
-        for block in rows.tensor_split(max(1, -(-len(rows) // _BLOCK))):
-            noise = None
-            if seed is not None:
-                drawn = [names[row] for row in block.tolist()]
-                noise = standard_normal(seed, drawn, now, self.policy.head.noise_width)
-            self._choose_together(following[block], noise)
-
-    def _choose_together(self, slots: Tensor, noise: Tensor | None) -> None:
-        """Lets the networks answer for vehicles at once."""
-        if len(slots) == 0:
-            return
-        store = self._store
-        history, state = self._known(slots)
-        chosen, after = self.policy.act(history, state, noise=noise)
-        store.parameters[slots] = chosen
-        store.score[slots], store.beyond[slots] = after.score, after.beyond
-        store.latent[slots] = after.latent
-        store.state[slots] = after.state[after.network, after.place]
-
-    def _observe(self, slots: Tensor) -> None:
-        """Lets the policy see windows of vehicles that somebody else drives."""
-        if len(slots) == 0:
-            return
-        history, state = self._known(slots)
-        after = self.policy.observe(history, state, torch.ones(len(slots), dtype=torch.bool))
-        self._store.state[slots] = after.state[after.network, after.place]
-
-    def _known(self, slots: Tensor) -> tuple[History, AgentState]:
-        """Returns the last frames of vehicles, and where the policy stands with them."""
-        store = self._store
-        begun, known = self._begun(slots), store.state[slots]
-        if len(self.policy.names) == 1:
-            state = known[None]
-        else:
-            state = begun.state.clone()
-            state[begun.network, begun.place] = known
-        now = begun._replace(state=state, latent=store.latent[slots])
-        return History(*store.history[slots].unbind(1)), now
-
-    def _speeds(
-        self, connection: Connection, names: list[str], slots: Tensor, seen: Seen, dt: float
-    ) -> tuple[Tensor, Tensor]:
-        """Takes a step of the model.
-
-        Returns:
-            The next speeds `(D,)`, within the limits that SUMO puts around them; and how hard
-            vehicles must be able to brake for them, m/s2, 0 where comfortably is enough.
-        """
-        store = self._store
-        follower = Follower(
-            torch.zeros_like(seen.speed), seen.speed, seen.acceleration, store.memory[slots]
-        )
-        zero = torch.zeros_like(seen.gap)
-        leader = Leader(seen.gap, seen.leader_speed, seen.leader_acceleration, zero)
-        p = self.policy.space.unpack(store.parameters[slots])
-        after = advance_vehicle(self._driven, follower, leader, p, dt)
-        store.memory[slots] = after.memory
-        speed, bound = after.speed, torch.zeros_like(seen.speed)
-        limits = self.model.limits
-        if limits is not None and self.speed_mode & _BOUNDS_BRAKING:
-            hardest = hardest_braking(seen, limits)
-            beyond = hardest > limits.comfortable_deceleration
-            for index in beyond.nonzero().flatten().tolist():
-                emergency = connection.vehicle.getEmergencyDecel(names[index])
-                hardest[index] = min(float(hardest[index]), emergency)
-            speed = torch.maximum(speed, (seen.speed - hardest * dt).clamp(min=0.0))
-            bound = torch.where(hardest > limits.comfortable_deceleration, hardest, 0.0)
-        limit = seen.allowed.clone()
-        # For a limit no vehicle brakes harder than its `decel`.
-        for index in (seen.speed > seen.allowed).nonzero().flatten().tolist():
-            slowest = seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
-            limit[index] = max(limit[index], slowest)
-        return torch.minimum(speed, limit), bound
-
-
-def _load_policy(run: str | Path) -> Agent:
-    """Reads the policy of a run.
-
-    Raises:
-        DataError: there is none, or the installed driving model has other parameters than it was
-            trained for.
-    """
-    folder = folder_of(run)
-    if not (folder / "policy.json").is_file():
-        folder /= "policy"
-    policy = load_checkpoint(folder)
-    written = parse_json((folder / "policy.json").read_text(encoding="utf-8"))
-    trained = written.get("parameters", [])
-    if tuple(trained) != policy.space.names:
-        raise DataError(
-            f"the policy of {run} was trained for a model with the parameters {', '.join(trained)},"
-            f" but model={policy.model_node['name']} here has {', '.join(policy.space.names)};"
-            " train it again"
-        )
-    return policy
+            self._assignments.forget(gone)

@@ -1,4 +1,4 @@
-"""What a live driver knows of vehicles, as one table of tensors.
+"""What a live driver knows of vehicles: one table of tensors, and whose row is which.
 
 Shapes: C vehicles, L frames of a token, n tuned parameters, m width of the model's memory, s width
 of the networks' state, k driver features, q numbers that a stochastic head keeps.
@@ -6,7 +6,7 @@ of the networks' state, k driver features, q numbers that a stochastic head keep
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, KeysView, Mapping
 from dataclasses import dataclass, fields
 
 import torch
@@ -108,6 +108,79 @@ class VehicleTable:
             both = [getattr(self, column.name), getattr(more, column.name)]
             columns[column.name] = torch.cat(both)
         return VehicleTable(**columns)
+
+
+class KnownVehicles:
+    """The vehicles of a live driver: a row of a table for each, and who is ahead of it.
+
+    The row of a vehicle that leaves is used again.
+
+    Attributes:
+        table: of all rows, used or not; another one as more rows are needed.
+        leaders: vehicle -> the one ahead of it at its last frame, where there was one.
+    """
+
+    def __init__(self, agent: Agent, model: DrivingModel) -> None:
+        """Begins without vehicles.
+
+        Args:
+            agent: whose state is kept.
+            model: whose memory is kept.
+        """
+        self._agent, self._model = agent, model
+        self.table = VehicleTable.empty(agent, model, 0)
+        self.leaders: dict[str, str] = {}
+        self._row_of: dict[str, int] = {}
+        self._unused: list[int] = []
+        self._last: list[str] = []
+        self._last_rows = torch.empty(0, dtype=torch.int64)
+
+    @property
+    def names(self) -> KeysView[str]:
+        """The vehicles, in the order in which they were added."""
+        return self._row_of.keys()
+
+    def row(self, name: str) -> int | None:
+        """Returns the row of a vehicle; None: it is not known."""
+        return self._row_of.get(name)
+
+    def rows(self, names: Iterable[str]) -> Tensor:
+        """Returns the rows of vehicles that are known, `(D,)` int64."""
+        return torch.tensor([self._row_of[name] for name in names], dtype=torch.int64)
+
+    def add(self, names: Iterable[str]) -> Tensor:
+        """Returns the rows of vehicles, `(D,)` int64; a new vehicle gets one."""
+        names = list(names)
+        for name in names:
+            if name in self._row_of:
+                continue
+            if not self._unused:
+                taken = len(self._row_of)
+                more = VehicleTable.empty(self._agent, self._model, max(16, taken))
+                self.table = self.table.with_rows(more)
+                self._unused = list(range(taken, len(self.table.time)))
+            self._row_of[name] = row = self._unused.pop()
+            self.table.time[row] = torch.nan  # it has no frame yet
+        return self.rows(names)
+
+    def were_last(self, names: list[str]) -> bool:
+        """Says whether `rows_again` was given these vehicles last, and none of them has gone."""
+        return names == self._last
+
+    def rows_again(self, names: list[str]) -> Tensor:
+        """Does what `add` does; mostly for the same vehicles, where nothing is looked up."""
+        if names != self._last:
+            self._last_rows = self.add(names)
+            self._last = list(names)
+        return self._last_rows
+
+    def drop(self, name: str) -> None:
+        """Drops a vehicle, if it is known."""
+        self.leaders.pop(name, None)
+        self._last, self._last_rows = [], torch.empty(0, dtype=torch.int64)
+        row = self._row_of.pop(name, None)
+        if row is not None:
+            self._unused.append(row)
 
 
 def _unknown(*shape: int) -> Tensor:

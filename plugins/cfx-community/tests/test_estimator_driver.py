@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import pytest
 import torch
-from tests.policies.test_estimators import ESTIMATORS, agent_of
 
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
@@ -16,6 +15,8 @@ pytest.importorskip("traci", reason="needs the extra sumo")
 
 from cfx_sumo.live.driver import Driver
 from tests.sumo.test_driver import Car, Road
+
+from .test_estimators import ESTIMATORS, agent_of
 
 
 def live(policy: EstimatorPolicy) -> Agent:
