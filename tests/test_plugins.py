@@ -22,6 +22,9 @@ from tests.broken_plugins import BROKEN, QUICK, Broken
 from tests.checkout import ROOT
 from tests.installer import Installer
 
+NOVEL = [kind for kind in registry.every_kind() if kind != "section"]
+"""Every kind of cfx's own; cfx-report adds sections where it is imported."""
+
 MODEL = """
     from cfx.plugin import DrivingModel, Parameter, ParameterSpace
 
@@ -231,6 +234,40 @@ def test_check_runs_the_contract_and_hints_at_what_could_be_better(
     )
 
 
+@pytest.mark.parametrize("kind", [kind for kind in NOVEL if kind in registry.PARTS])
+def test_a_kind_without_a_contract_is_loaded_and_said_to_have_none(kind: str, capsys) -> None:
+    name = registry.names(kind)[0]
+    assert cli.main(["plugins", "check", kind, name]) == 0
+    printed = capsys.readouterr()
+    assert re.search(rf"^ *{kind} +{name} .* fine *$", printed.out, re.MULTILINE)
+    (hint,) = re.findall(r"^Hint: .*$", printed.out, re.MULTILINE)
+    assert hint.startswith(f"Hint: the kind '{kind}' has no contract")
+    assert printed.err == ""
+
+
+def test_a_broken_class_of_a_kind_without_a_contract_is_one_sentence(
+    install: Installer, capsys
+) -> None:
+    code = "from cfx.plugin import ParameterHead\nclass Half(ParameterHead):\n    name = 'half'\n"
+    install("half-heads", {"cfx.heads": {"half": "half_heads:Half"}}, {"half_heads.py": code})
+    assert cli.main(["plugins", "check", "head", "half"]) == 1
+    (complaint,) = capsys.readouterr().err.splitlines()
+    assert "half-heads 1.0 does not implement for_model, unit_parameters, " in complaint
+
+
+def test_a_kind_of_another_distribution_has_no_template(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
+) -> None:
+    another = registry.Kind("poster", "cfx.core.component:Component", chosen=False)
+    monkeypatch.setitem(registry.PARTS, "poster", another)
+    monkeypatch.chdir(tmp_path)
+    assert cli.main(["plugins", "new", "poster", "mine"]) == 2
+    (said,) = capsys.readouterr().err.splitlines()
+    assert said.startswith("there is no template of the kind 'poster'; there are templates of: ")
+    assert "entry point of the group cfx.posters" in said
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_distribution_that_declares_no_api_counts_as_current_and_gets_a_hint(
     install: Installer, capsys
 ) -> None:
@@ -267,9 +304,10 @@ PROTOCOL = """
         (["show", "data", "tdy"], "data=tdy: there is no dataset 'tdy'. Did you mean 'tidy'?"),
         (["new", "modle", "mine"], "there is no kind of component 'modle'. Did you mean 'model'?"),
         (
-            ["new", "tracker", "mine"],
-            "there is no template of the kind 'tracker'; there are templates of: command, ",
+            ["new", "figur", "mine"],
+            "there is no kind of component 'figur'. Did you mean 'figure'?",
         ),
+        (["check", "head", "ofset"], "there is no head 'ofset'. Did you mean 'offset'?"),
         (["new", "model", "krauss"], "the name 'krauss' is taken by model 'krauss'"),
         (
             ["new", "model", "My-Model"],
@@ -344,6 +382,25 @@ def test_show_tells_everything_about_every_component(capsys) -> None:
     assert re.search(r"samples +4096 +int, >= 1 +evaluations of each problem", printed)
 
 
+@pytest.mark.parametrize(
+    ("kind", "name", "use"),
+    [
+        ("figure", "drives", "Every job that has what it shows draws it: figures/drives.png."),
+        ("head", "offset", "Choose it with learner.head=offset."),
+        ("export", "onnx", "Choose it with cfx export JOB --to onnx."),
+        ("posterior", "laplace", "Choose it with calibration.posterior=laplace."),
+        ("tracker", "mlflow", "Choose it with tracking.name=mlflow."),
+    ],
+)
+def test_show_says_how_one_asks_for_what_has_no_settings(
+    kind: str, name: str, use: str, capsys
+) -> None:
+    assert cli.main(["plugins", "show", kind, name]) == 0
+    printed = capsys.readouterr().out
+    assert use in printed
+    assert "It has no settings." in printed
+
+
 def test_plugins_lists_metadata_and_loads_nothing(install: Installer, capsys) -> None:
     install(
         "bad-models",
@@ -400,17 +457,7 @@ def test_the_shell_completes_a_plugins_name_and_its_parameters(install: Installe
 
 
 GENERATED = [
-    pytest.param("model"),
-    pytest.param("simulator", marks=pytest.mark.slow),
-    pytest.param("dataset", marks=pytest.mark.slow),
-    pytest.param("optimizer", marks=pytest.mark.slow),
-    pytest.param("objective", marks=pytest.mark.slow),
-    pytest.param("policy", marks=pytest.mark.slow),
-    pytest.param("engine", marks=pytest.mark.slow),
-    pytest.param("learner", marks=pytest.mark.slow),
-    pytest.param("protocol", marks=pytest.mark.slow),
-    pytest.param("table", marks=pytest.mark.slow),
-    pytest.param("command", marks=pytest.mark.slow),
+    pytest.param(kind, marks=[] if kind == "model" else pytest.mark.slow) for kind in NOVEL
 ]
 
 
@@ -439,10 +486,18 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
     assert "failed" not in tests
     group = registry.kind_of(kind).group
     presets = [path.stem for path in folder.glob(f"cfx_novel_{kind}/conf/{group}/*.yaml")]
-    asked = "--help"
-    if kind not in {"command", "table"}:
+    asked = f"plugins show {kind} novel_{kind}"
+    expected = f"cfx_novel_{kind}.{kind}:Novel{kind.capitalize()}"
+    if kind == "command":
+        asked = "--help"
+        expected = (
+            "cfx novel_command how much each of some jobs improves on constant parameters"
+            " (from cfx-novel-command)"
+        )
+    if presets:
         (preset,) = presets
         asked = f"--cfg job {group}={preset}"
+        expected = f"name: novel_{kind}"
     script = (
         "import sys; from cfx.app.cli import main;"
         " sys.exit(max(main(words.split()) for words in sys.argv[1:]))"
@@ -453,12 +508,6 @@ def test_a_new_package_installs_and_its_tests_pass(kind: str, tmp_path: Path, ca
         rf"{kind} +novel_{kind} +cfx-novel-{kind} +0\.1\.0 .* fine *$", said, re.MULTILINE
     )
     assert "declares no version" not in said
-    expected = "" if kind == "table" else f"name: novel_{kind}"
-    if kind == "command":
-        expected = (
-            "cfx novel_command how much each of some jobs improves on constant parameters"
-            " (from cfx-novel-command)"
-        )
     assert expected in said
 
 
@@ -495,18 +544,18 @@ def run(command: list[str], environment: dict[str, str]) -> str:
 def novel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a new package of each kind."""
     home = tmp_path_factory.mktemp("novel") / "deep"
-    for kind in registry.KINDS:
+    for kind in NOVEL:
         create(kind, "novel", home / kind)
     return home
 
 
-@pytest.mark.parametrize("kind", list(registry.KINDS))
+@pytest.mark.parametrize("kind", NOVEL)
 def test_a_new_package_declares_what_it_is(kind: str, novel: Path) -> None:
     folder = novel / kind
     project = tomllib.loads((folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     assert project["name"] == "cfx-novel"
     assert any(one.startswith("cfx-driving>=") and "<" in one for one in project["dependencies"])
-    assert project["entry-points"][registry.KINDS[kind].entry_points] == {
+    assert project["entry-points"][registry.kind_of(kind).entry_points] == {
         "novel": f"cfx_novel.{kind}:Novel"
     }
     assert project["entry-points"]["cfx.api"] == {str(cfx.plugin.API_VERSION): "cfx_novel"}
@@ -519,7 +568,7 @@ def test_a_new_package_declares_what_it_is(kind: str, novel: Path) -> None:
             path
         )
     assert "Licence" in (folder / "README.md").read_text(encoding="utf-8")
-    assert {path.name for path in novel.iterdir()} == set(registry.KINDS)
+    assert {path.name for path in novel.iterdir()} == set(NOVEL)
 
 
 def test_a_new_package_is_clean(novel: Path) -> None:
