@@ -68,7 +68,11 @@ def test_the_examples_of_drivers_elsewhere_run_from_wheels(
             archive.extractall(site)
     example = ROOT / "plugins" / "cfx-drivers" / "examples" / "platoon.py"
     done = subprocess.run(
-        [sys.executable, ROOT / "tests" / "driver_examples.py", example],
+        [
+            sys.executable,
+            ROOT / "plugins" / "cfx-drivers" / "tests" / "driver_examples.py",
+            example,
+        ],
         cwd=work,
         env={**os.environ, "PYTHONPATH": str(site)},
         capture_output=True,
