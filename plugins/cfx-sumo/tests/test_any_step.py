@@ -15,7 +15,9 @@ from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.driver import Driver
 from cfx_sumo.live.fleet import Fleet
 from tests.agents import adaptive
-from tests.sumo.test_driver import Car, Road
+from tests.road import Car, Road
+
+pytest.importorskip("traci", reason="needs the extra sumo")
 
 SECONDS = 30
 
