@@ -54,7 +54,7 @@ kills: $(VENV)/.ready-test
 	CFX_KILLS=$(or $(KILLS),100) $(BIN)/python -m pytest -m slow tests/fuzz/test_kills.py -s
 
 bench: $(VENV)/.ready-test
-	$(BIN)/python -m pytest tests/benchmarks -m "" --override-ini addopts="--import-mode=importlib" --benchmark-only
+	$(BIN)/python -m pytest tests/benchmarks plugins/*/tests/benchmarks -m "" --override-ini addopts="--import-mode=importlib" --benchmark-only
 
 DATA ?= ../shared/data
 

@@ -23,7 +23,7 @@ from tests.installer import Installer
 if TYPE_CHECKING:
     from cfx.data.pairs import PairSet
 
-pytest_plugins = ["tests.browser"]
+pytest_plugins = ["tests.browser", "tests.bucket", "tests.flat"]
 
 # A slow machine is no failure, and a failure must come again on the next run.
 settings.register_profile("cfx", deadline=None, derandomize=True, max_examples=50)

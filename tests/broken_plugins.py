@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from tests.installer import Installer
+
 QUICK = (
     "model=krauss",
     "learner=imitation",
@@ -372,3 +374,33 @@ BROKEN = (
         r"run must return a cfx\.plugin\.ProtocolResult, but returned a dict",
     ),
 )
+
+
+MODEL = """
+    from cfx.plugin import DrivingModel, Parameter, ParameterSpace
+
+    class Mine(DrivingModel):
+        '''Drives as I like.'''
+
+        parameters = ParameterSpace.of(Parameter("tau", "s", 0.5, 3.0, 1.0, "time gap", "made up"))
+        reference = "made up"
+
+        def next_speed(self, follower, leader, p, dt):
+            gap = leader.position - leader.length - follower.position
+            return (gap / p["tau"]).clamp(min=0.0, max=30.0)
+"""
+
+
+def put(install: Installer, broken: Broken) -> None:
+    install(broken.distribution, broken.entry_points, dict(broken.files))
+
+
+def install_twins(install: Installer) -> None:
+    """Installs two distributions that chose the same name, and one that chose krauss."""
+    install("twin-one", {"cfx.models": {"twin": "twin_one:Mine"}}, {"twin_one.py": MODEL})
+    install(
+        "twin-two", {"cfx.models": {"twin": "twin_two:Mine"}}, {"twin_two.py": MODEL}, version="2.0"
+    )
+    install(
+        "usurper", {"cfx.models": {"krauss": "usurper:Mine"}}, {"usurper.py": "raise SystemExit(0)"}
+    )

@@ -15,8 +15,6 @@ from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import VALUE_COLUMNS
-from cfx_forecasts.distributions import DISTRIBUTION_COLUMNS
-from cfx_forecasts.errors import FORECAST_COLUMNS, FORECAST_METHODS
 
 TWO = ParameterSpace.of(
     Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time"),
@@ -179,6 +177,45 @@ def make_history(
         for k, one in enumerate(trajectories)
     ]
     return pd.DataFrame(rows)
+
+
+FORECAST_METHODS = (
+    "constant_speed",
+    "constant_acceleration",
+    "default",
+    "population",
+    "population_residual",
+    "fixed",
+    "fixed_residual",
+    "policy",
+)
+FORECAST_COLUMNS = (
+    "pair_id",
+    "driver",
+    "method",
+    "history_s",
+    "horizon_s",
+    "speed_error",
+    "position_error",
+    "ade",
+)
+DISTRIBUTION_COLUMNS = (
+    "pair_id",
+    "driver",
+    "method",
+    "horizon_s",
+    "crps_speed",
+    "crps_gap",
+    "energy_speed",
+    "coverage",
+    "min_ade",
+    "pit",
+    "likelihood_speed",
+    "likelihood_gap",
+    "likelihood_acceleration",
+    "likelihood_jerk",
+    "likelihood_time_to_collision",
+)
 
 
 def make_forecasts(drivers: int = 6, methods: tuple[str, ...] = FORECAST_METHODS) -> pd.DataFrame:

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import logging
 import re
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,44 +19,13 @@ from cfx.core.storage import RemoteFolder, is_url, local_copies, state
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.errors import CfxError, DataError, OutputError
 from cfx.results.config import JobConfig
-from cfx_report.runs import read_runs
 from tests.broken_plugins import QUICK
 from tests.drives import straight_pairs
-from tests.report.conftest import blank_drawings
 
 pytest.importorskip("moto", reason="moto stands in for S3")
 
 KEY = "ab" * 32
 JOB = (*QUICK, "data.pairs=3")
-
-
-@pytest.fixture(scope="module")
-def server() -> Iterator[str]:
-    from moto.server import ThreadedMotoServer
-
-    logging.getLogger("werkzeug").setLevel(logging.ERROR)
-    made = ThreadedMotoServer(ip_address="127.0.0.1", port=0, verbose=False)
-    made.start()
-    host, port = made.get_host_and_port()
-    yield f"http://{host}:{port}"
-    made.stop()
-
-
-@pytest.fixture
-def bucket(server: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
-    """Yields the URL of an empty bucket; the environment says where the store is."""
-    import s3fs
-
-    monkeypatch.setenv("AWS_ENDPOINT_URL", server)
-    monkeypatch.setenv("AWS_ACCESS_KEY_ID", "test")
-    monkeypatch.setenv("AWS_SECRET_ACCESS_KEY", "test")
-    monkeypatch.setenv("AWS_DEFAULT_REGION", "us-east-1")
-    monkeypatch.setenv("CFX_DATA_CACHE", str(tmp_path / "copies"))
-    s3fs.S3FileSystem.clear_instance_cache()
-    name = tmp_path.name.replace("_", "-").lower().strip("-")
-    s3fs.S3FileSystem().mkdir(name)
-    yield f"s3://{name}"
-    s3fs.S3FileSystem.clear_instance_cache()
 
 
 def put(url: str, path: Path) -> None:
@@ -178,7 +145,7 @@ def copy_of_a_job(folder: Path, url: str, metrics: str) -> None:
 
 
 def test_a_job_whose_folder_was_copied_is_read_from_its_url(
-    bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     folder = tmp_path / "outputs" / "today" / "mine"
     url = f"{bucket}/jobs/today/mine"
@@ -195,27 +162,6 @@ def test_a_job_whose_folder_was_copied_is_read_from_its_url(
     assert found.pairs.equals(here.pairs)
     assert found.folder != folder
     assert cfx.load(f"{url}/").folder == found.folder, "nothing is copied twice"
-
-    monkeypatch.chdir(tmp_path)
-    with blank_drawings():
-        assert cli.main(["report", url]) == 0
-    assert cli.main(["report", url, "--tables", "csv"]) == 0
-    assert cli.main(["export", url, "--to", "sumo"]) == 0
-    assert url in (tmp_path / "report.html").read_text(encoding="utf-8")
-    assert (tmp_path / "report.csv").is_file()
-    assert (tmp_path / "drivers.add.xml").is_file()
-
-
-def test_a_sweep_whose_jobs_were_copied_is_read_from_its_url(
-    bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    sweep = tmp_path / "sweep"
-    arguments = ["-m", *JOB, "seed=0,1", f"hydra.sweep.dir={sweep}", f"output.url={bucket}"]
-    assert cli.main(arguments) == 0
-    runs = read_runs([f"{bucket}/sweep"])
-    assert {found.place for found in runs.jobs} == {
-        f"{bucket}/sweep/{folder.name}" for folder in sweep.iterdir() if folder.is_dir()
-    }
 
 
 def test_what_an_earlier_job_left_at_a_url_goes_and_nothing_else(

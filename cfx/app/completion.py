@@ -90,11 +90,11 @@ def complete_with(
 
 
 def add_kind(parser: argparse.ArgumentParser, *, optional: bool = False) -> None:
-    """Adds the argument `kind`: of components, all kinds if it may be left out."""
+    """Adds the argument `kind`; it means all kinds if it may be left out."""
     from cfx.core import registry
 
-    about = f"{', '.join(registry.KINDS)} (data is a dataset too)"
+    about = f"{', '.join(registry.every_kind())} (data is a dataset too)"
     if optional:
         about += "; all kinds if left out"
     action = parser.add_argument("kind", nargs="?" if optional else None, help=about)
-    complete_with(action, lambda _: registry.KINDS)
+    complete_with(action, lambda _: registry.every_kind())

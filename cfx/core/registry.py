@@ -88,7 +88,7 @@ class Kind:
         if self.name == "command":
             return f"cfx {component}"
         if self.name == "export":
-            return f"cfx export --to {component}"
+            return f"cfx export JOB --to {component}"
         return f"{self.group}={component}"
 
 
@@ -145,7 +145,7 @@ PARTS: dict[str, Kind] = {
         Kind("tracker", "cfx.results.tracker:Tracking", group="tracking.name", chosen=False),
     )
 }
-"""Kinds of classes that come in the same way, are no components to configure, and have no suite.
+"""Kinds of classes that come in the same way, have no settings, and no contract in cfx-contracts.
 
 `add_kind` adds those of other distributions.
 """
@@ -207,9 +207,14 @@ def add_kind(kind: Kind) -> None:
     Raises:
         PluginError: there is another kind of that name.
     """
-    if {**KINDS, **PARTS}.get(kind.name, kind) != kind:
+    if every_kind().get(kind.name, kind) != kind:
         raise PluginError(f"there is a kind '{kind.name}' already; choose another name")
     PARTS[kind.name] = kind
+
+
+def every_kind() -> dict[str, Kind]:
+    """Returns all kinds by name: components first, then what comes in the same way."""
+    return {**KINDS, **PARTS}
 
 
 def kind_of(kind: str) -> Kind:
@@ -218,11 +223,12 @@ def kind_of(kind: str) -> Kind:
     Raises:
         PluginError: there is no such kind.
     """
-    for found in (*KINDS.values(), *PARTS.values()):
+    kinds = every_kind()
+    for found in kinds.values():
         if kind in {found.name, found.group}:
             return found
     raise PluginError(
-        f"there is no kind of component '{kind}'.{nearest(kind, KINDS)} Known: {', '.join(KINDS)}."
+        f"there is no kind of component '{kind}'.{nearest(kind, kinds)} Known: {', '.join(kinds)}."
     )
 
 
@@ -573,7 +579,7 @@ def _announced(
 
 def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[str, Entry]]:
     """Yields what one distribution announces, each with its entry-point group."""
-    kinds = {kind.entry_points: kind.name for kind in (*KINDS.values(), *PARTS.values())}
+    kinds = {kind.entry_points: kind.name for kind in every_kind().values()}
     points = [point for point in distribution.entry_points if point.group.startswith("cfx.")]
     api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
     ours = [point for point in points if point.group != API_GROUP]
@@ -707,7 +713,7 @@ def blame(
 def _packages() -> dict[Path, Entry]:
     """Returns the places of plugins' code: a package's folder, or a single module's file."""
     found: dict[Path, Entry] = {}
-    for kind in (*KINDS, *PARTS):
+    for kind in every_kind():
         for one in entries(kind):
             if one.distribution not in {OWN, THIS_PROCESS}:
                 for place in _places(one.package):

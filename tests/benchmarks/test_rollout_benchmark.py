@@ -22,11 +22,11 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Leader
+from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import Compile, MemoryStepper, can_compile
 from cfx.simulation.trajectory import Start
-from cfx_community.models.w74 import W74
 
 numba = pytest.importorskip("numba")
 
@@ -161,7 +161,7 @@ def best_time(run: Callable[[], object], rounds: int = 12) -> float:
 @pytest.mark.benchmark(group="rollout")
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float32], ids=["float64", "float32"])
 @pytest.mark.parametrize("mode", ["never", "always"], ids=["eager", "compiled"])
-@pytest.mark.parametrize("model", [Krauss(), W99(), W74()], ids=["krauss", "w99", "w74"])
+@pytest.mark.parametrize("model", [Krauss(), W99(), IDM()], ids=["krauss", "w99", "idm"])
 def test_rollout(benchmark: Any, model: DrivingModel, mode: Compile, dtype: torch.dtype) -> None:
     if mode == "always" and not can_compile(torch.device("cpu")):
         pytest.skip("there is no C++ compiler here")

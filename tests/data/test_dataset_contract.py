@@ -9,7 +9,6 @@ import pytest
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx_contracts import check_contract
-from cfx_recordings.ngsim import NgsimDataset
 
 
 def test_noisy_synthetic_recordings_of_another_model() -> None:
@@ -27,8 +26,3 @@ def test_tidy_tables(name: str, tmp_path: Path) -> None:
 def test_real_pairs(shared_data: Path) -> None:
     path = shared_data / "i80_reconstructed_pairs.parquet"
     check_contract(TidyDataset(path=path, min_duration=100))
-
-
-def test_real_ngsim(shared_data: Path) -> None:
-    path = shared_data / "i80_0400_raw_sample.csv.gz"
-    check_contract(NgsimDataset(path=path, min_duration=65))

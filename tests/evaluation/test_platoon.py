@@ -25,9 +25,9 @@ from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.krauss import Krauss
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
-from cfx_sumo.vtype import SumoVType
 from tests.agents import adaptive as live
 from tests.evaluation.test_closed_loop import adaptive, constant
+from tests.without_equations import WithoutEquations
 
 
 class Linear(DrivingModel):
@@ -196,5 +196,4 @@ def test_the_leader_does_what_the_manoeuvre_says() -> None:
 
 
 def test_a_model_without_equations_has_no_platoon() -> None:
-    model = SumoVType(parameters={"tau": {"low": 0.5, "high": 3.0, "default": 1.0}})
-    assert measure_platoons(model, {}) is None
+    assert measure_platoons(WithoutEquations(), {}) is None

@@ -16,7 +16,6 @@ from cfx.models.krauss import Krauss
 from cfx.models.limits import LimitSettings, at_limits, limited_speed
 from cfx.models.w99 import W99
 from cfx.simulation.step import advance_vehicle
-from cfx_community.models.w74 import W74
 
 DT = 0.1
 speeds = st.floats(0.0, 60.0)
@@ -59,12 +58,8 @@ def test_a_response_time_is_a_first_order_lag() -> None:
     assert float(acceleration) == pytest.approx(1.5 * (1.0 - math.exp(-0.7 / 0.4)))
 
 
-@pytest.mark.parametrize(
-    "model", [Krauss(), IDM(), W99(), W74()], ids=lambda one: type(one).__name__
-)
-@given(seed=st.integers(0, 1000))
-def test_any_parameters_at_any_moment_keep_to_the_limits(model: DrivingModel, seed: int) -> None:
-    """So that a change of parameters never makes the speed jump."""
+def check_limits(model: DrivingModel, seed: int) -> None:
+    """Takes a step from 32 random states with random parameters, and looks at the accelerations."""
     generator = torch.Generator().manual_seed(seed)
 
     def between(low: float, high: float) -> torch.Tensor:
@@ -79,6 +74,13 @@ def test_any_parameters_at_any_moment_keep_to_the_limits(model: DrivingModel, se
     after = advance_vehicle(model, follower, leader, p, DT)
     assert bool((after.acceleration <= 2.6 + 1e-9).all())
     assert bool((after.acceleration >= -9.0 - 1e-9).all())
+
+
+@pytest.mark.parametrize("model", [Krauss(), IDM(), W99()], ids=lambda one: type(one).__name__)
+@given(seed=st.integers(0, 1000))
+def test_any_parameters_at_any_moment_keep_to_the_limits(model: DrivingModel, seed: int) -> None:
+    """So that a change of parameters never makes the speed jump."""
+    check_limits(model, seed)
 
 
 def test_frames_at_a_limit_are_found() -> None:

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -9,7 +8,6 @@ from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.models.krauss import Krauss
 from cfx.models.regimes import where_below, where_up_to
 from cfx.models.w99 import W99
-from cfx_community.models.w74 import W74
 
 numbers = st.floats(-50.0, 50.0)
 
@@ -54,8 +52,7 @@ def states(count: int = 400) -> tuple[Follower, Leader]:
     return follower, leader
 
 
-@pytest.mark.parametrize("model", [W99(), W74()], ids=["w99", "w74"])
-def test_a_smoothed_model_tends_to_the_exact_one(model: DrivingModel) -> None:
+def check_that_it_tends_to_the_exact_one(model: DrivingModel) -> None:
     """All but the states that lie on a threshold give the same speed as temperature goes to 0."""
     follower, leader = states()
     p = model.space.unpack(model.space.defaults())
@@ -69,13 +66,8 @@ def test_a_smoothed_model_tends_to_the_exact_one(model: DrivingModel) -> None:
     assert model.temperature == 0
 
 
-@pytest.mark.parametrize(
-    ("model", "names"),
-    [(W99(), ("cc1", "cc2", "cc4", "cc5")), (W74(), ("bx_add", "sdx_mult", "cx"))],
-)
-def test_thresholds_have_a_gradient_only_in_the_smoothed_model(
-    model: DrivingModel, names: tuple[str, ...]
-) -> None:
+def check_that_only_smoothing_gives_gradients(model: DrivingModel, names: tuple[str, ...]) -> None:
+    """Parameters of thresholds have more gradients in the smoothed model than in the exact one."""
     follower, leader = states()
     shares = []
     for used in (model, model.at_temperature(torch.tensor(1.0))):
@@ -86,6 +78,14 @@ def test_thresholds_have_a_gradient_only_in_the_smoothed_model(
         columns = [model.space.names.index(name) for name in names]
         shares.append(float((values.grad[:, columns].abs() > 1e-6).double().mean()))
     assert shares[1] > 1.5 * shares[0]
+
+
+def test_a_smoothed_model_tends_to_the_exact_one() -> None:
+    check_that_it_tends_to_the_exact_one(W99())
+
+
+def test_thresholds_have_a_gradient_only_in_the_smoothed_model() -> None:
+    check_that_only_smoothing_gives_gradients(W99(), ("cc1", "cc2", "cc4", "cc5"))
 
 
 def test_a_model_without_regimes_stays_as_it_is() -> None:

@@ -19,8 +19,8 @@ from cfx.models.w99 import W99
 from cfx.simulation.kernel.run import model_key
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
-from cfx_sumo.vtype import SumoVType
 from tests.models.wrapped import CHECKS
+from tests.without_equations import WithoutEquations
 
 DT = 0.1
 
@@ -193,4 +193,4 @@ def test_compiled_code_is_that_of_the_inner_model() -> None:
 
 def test_a_model_without_equations_is_refused() -> None:
     with pytest.raises(ConfigError, match="has equations in sumo only"):
-        WithResidual(SumoVType(parameters={"tau": {"low": 0.5, "high": 3.0, "default": 1.0}}))
+        WithResidual(WithoutEquations())

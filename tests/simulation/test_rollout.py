@@ -12,15 +12,15 @@ from torch import Tensor
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Leader
+from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.simulation import rollout
 from cfx.simulation.rollout import MemoryStepper, can_compile, simulate_follower
 from cfx.simulation.trajectory import Start, Trajectory
-from cfx_community.models.w74 import W74
 
 DT = 0.1
-MODELS = [Krauss(), W99(), W74()]
+MODELS = [Krauss(), W99(), IDM()]
 each_model = pytest.mark.parametrize("model", MODELS, ids=lambda model: type(model).__name__)
 
 
@@ -212,7 +212,7 @@ def test_collisions_are_reported_and_the_drive_goes_on() -> None:
         torch.tensor([5.0]).double(),
     )
     zero = torch.zeros(1, dtype=torch.float64)
-    out = simulate_follower(W74(), None, leader, Start(zero, zero + 20.0, zero), DT)
+    out = simulate_follower(IDM(), None, leader, Start(zero, zero + 20.0, zero), DT)
     assert not out.collided[0, 0]
     assert out.collided[0, -1]
     assert torch.equal(out.collided, out.gap < 0)
@@ -252,7 +252,7 @@ def test_gradients_flow_through_the_drive() -> None:
     assert torch.autograd.grad(final(p).sum(), p)[0].abs().sum() > 0
 
 
-@pytest.mark.parametrize("model", [W99(), W74()], ids=lambda model: type(model).__name__)
+@pytest.mark.parametrize("model", [W99(), IDM()], ids=lambda model: type(model).__name__)
 def test_gradients_stay_finite_through_standstill_and_contact(model: DrivingModel) -> None:
     leader = Leader(*(x[:, None] for x in wavy_leader(3, 50)))
     zero = torch.zeros((3, 4), dtype=torch.float64)

@@ -16,7 +16,7 @@ from cfx.models.krauss import Krauss
 from cfx.results.config import JobConfig
 from cfx.simulation.base import Simulator
 from cfx.simulation.rollout import MemorySimulator, MemoryStepper
-from cfx_sumo.vtype import SumoVType
+from tests.without_equations import WithoutEquations
 
 QUICK = [
     "model=krauss",
@@ -67,9 +67,8 @@ def test_it_is_the_public_name_and_memory_the_default() -> None:
 
 
 def test_a_model_without_equations_is_refused_by_what_uses_equations() -> None:
-    model = SumoVType(parameters={"tau": {"low": 0.5, "high": 3.0, "default": 1.0}})
     with pytest.raises(ConfigError, match=r"no equations in Python; add simulator=sumo, which"):
-        MemorySimulator().require(model)
+        MemorySimulator().require(WithoutEquations())
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ from pydantic_core import to_jsonable_python
 from cfx.app.completion import add_kind, complete_with
 from cfx.core import registry
 from cfx.core.command import Command
+from cfx.core.component import Component
 from cfx.core.console import blank_table, print_table
 
 if TYPE_CHECKING:
@@ -50,10 +51,10 @@ class PluginsCommand(Command):
 
 
 def overview() -> None:
-    """Prints a row for every component. Imports none."""
+    """Prints a row for everything that is installed. Imports none of it."""
     rows = blank_table("kind", "name", "distribution", "version", "from", "state")
     states = set()
-    for kind in registry.KINDS:
+    for kind in registry.every_kind():
         for entry in registry.entries(kind):
             now = _state(entry)
             states.add(now)
@@ -75,6 +76,8 @@ def _state(entry: registry.Entry) -> str:
 def show(kind: str, name: str) -> None:
     """Prints what a component is: where it comes from, what it does, its parameters and settings.
 
+    Heads, formats of `cfx export`, posteriors and places that keep runs have no settings.
+
     Raises:
         PluginError: there is none of that name, or it cannot be loaded.
     """
@@ -82,7 +85,8 @@ def show(kind: str, name: str) -> None:
     cls: Any = registry.get(kind, name)
     group = registry.kind_of(kind).group
     print(f"{entry}\n{entry.location}\n{_use(entry, cls)}\n")
-    if cls.deprecated:
+    is_component = issubclass(cls, Component)
+    if is_component and cls.deprecated:
         print(f"Deprecated: {cls.deprecated}\n")
     print(f"{inspect.getdoc(cls) or '(its class has no docstring)'}\n")
     reference = getattr(cls, "reference", "")
@@ -99,9 +103,10 @@ def show(kind: str, name: str) -> None:
     title = f"Settings (set with {group}.SETTING=VALUE)"
     settings = blank_table("setting", "default", "values", "meaning", title=title)
     settings.columns[0].no_wrap = True
-    for row in _settings(cls.schema):
-        if entry.kind != "model" or row[0] != "parameters":
-            settings.add_row(*row)
+    if is_component:
+        for row in _settings(cls.schema):
+            if entry.kind != "model" or row[0] != "parameters":
+                settings.add_row(*row)
     if settings.row_count:
         print_table(settings)
     else:
@@ -110,14 +115,17 @@ def show(kind: str, name: str) -> None:
 
 def _use(entry: registry.Entry, cls: Any) -> str:
     """Returns how a component comes into a job."""
-    name, group = entry.name, registry.kind_of(entry.kind).group
+    name, kind = entry.name, registry.kind_of(entry.kind)
     if entry.kind == "command":
         return f"Run it with cfx {name}; cfx {name} --help says what it takes."
     if entry.kind == "table":
         return f"tables=[own,{name}] writes {name}{cls.suffix} where a job has rows of it."
+    if entry.kind == "figure":
+        return f"Every job that has what it shows draws it: figures/{name}.png."
     if entry.kind == "metric":
-        return f"{group}=[own,{name}] measures it; {group}={name} only what jobs need beside it."
-    return f"Choose it with {group}={name}."
+        choice = kind.call(name)
+        return f"metrics=[own,{name}] measures it; {choice} only what jobs need beside it."
+    return f"Choose it with {kind.call(name)}."
 
 
 def _metric(cls: Any) -> Table:

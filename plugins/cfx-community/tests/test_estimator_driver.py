@@ -14,7 +14,7 @@ from cfx_community.policies.estimator import EstimatorPolicy
 pytest.importorskip("traci", reason="needs the extra sumo")
 
 from cfx_sumo.live.driver import Driver
-from tests.sumo.test_driver import Car, Road
+from tests.road import Car, Road
 
 from .test_estimators import ESTIMATORS, agent_of
 

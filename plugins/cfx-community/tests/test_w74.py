@@ -2,12 +2,19 @@ from __future__ import annotations
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from torch import Tensor
 
 from cfx.models.base import Follower, Leader
 from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.trajectory import Start
 from cfx_community.models.w74 import W74
+from tests.models.test_limits import check_limits
+from tests.models.test_regimes import (
+    check_that_it_tends_to_the_exact_one,
+    check_that_only_smoothing_gives_gradients,
+)
 
 L, V = 5.0, 10.0
 AX, ABX = L + 2.0, L + 2.0 + 3.5 * V**0.5
@@ -94,3 +101,16 @@ def test_behind_a_steady_leader_it_swings_between_the_thresholds() -> None:
     assert spacing.max() < SDX + 0.5
     assert (out.speed[1500:] - V).abs().max() < 1.0
     assert out.speed[1500:].std() > 0  # unconscious following never settles
+
+
+def test_the_smoothed_model_tends_to_the_exact_one() -> None:
+    check_that_it_tends_to_the_exact_one(W74())
+
+
+def test_thresholds_have_a_gradient_only_in_the_smoothed_model() -> None:
+    check_that_only_smoothing_gives_gradients(W74(), ("bx_add", "sdx_mult", "cx"))
+
+
+@given(seed=st.integers(0, 1000))
+def test_any_parameters_at_any_moment_keep_to_the_limits(seed: int) -> None:
+    check_limits(W74(), seed)

@@ -13,7 +13,7 @@ from cfx.app import nodes
 from cfx.app.completion import add_kind, complete_with
 from cfx.core import registry
 from cfx.core.command import Command
-from cfx.core.component import API_VERSION
+from cfx.core.component import API_VERSION, Component
 from cfx.core.console import blank_table, console_logging, print_table
 from cfx.core.contract import violations
 from cfx.core.distributions import OWN
@@ -108,7 +108,8 @@ def _unheard() -> Iterator[None]:
 def _chosen(kind: str | None, name: str | None) -> list[registry.Entry]:
     """Returns the entries of all kinds or one, of all names or one."""
     found = []
-    for one in registry.KINDS if kind is None else [registry.kind_of(kind).name]:
+    kinds = list(registry.every_kind()) if kind is None else [registry.kind_of(kind).name]
+    for one in kinds:
         for entry in registry.entries(one):
             if name is None or entry.name == name:
                 found.append(entry)
@@ -120,23 +121,25 @@ def _chosen(kind: str | None, name: str | None) -> list[registry.Entry]:
 def examine(entry: registry.Entry) -> Verdict:
     """Tries one component with its default settings, or those of its `trial`.
 
-    Whatever the component does, this returns.
+    Of a kind without a contract the class is imported and examined, no more. Whatever the component
+    does, this returns.
     """
     shadow = _shadow(entry)
     if shadow:
         return Verdict(entry, "shadowed", shadow)
+    complaint = hint = ""
     try:
         cls = registry.get(entry.kind, entry.name)
-        nodes.render(cls, entry.name)
-        fields = cls.schema.model_fields.items()
-        required = [name for name, field in fields if registry.is_blank(field)]
-        if required:
-            group = registry.kind_of(entry.kind).group
-            keys = ", ".join(f"{group}.{name}" for name in required)
-            hint = f"{entry.kind} '{entry.name}' was loaded but not tried: it needs {keys}."
-            return Verdict(entry, "fine", hint=hint)
-        component = registry.create(entry.kind, {"name": entry.name, **cls.trial})
-        complaint = _broken_contract(entry, component)
+        if entry.kind in registry.KINDS:
+            nodes.render(cls, entry.name)
+            hint = _not_tried(entry, cls)
+            if not hint:
+                component = registry.create(entry.kind, {"name": entry.name, **cls.trial})
+                complaint = _broken_contract(entry, component)
+        else:
+            hint = (
+                f"the kind '{entry.kind}' has no contract: its classes were loaded but not tried."
+            )
     except NotInstalledError as error:
         return Verdict(entry, "not installed", hint=str(error))
     except CfxError as error:
@@ -147,14 +150,26 @@ def examine(entry: registry.Entry) -> Verdict:
         complaint = f"{entry} cannot be used with its default settings: {in_words(error)}"
     if complaint:
         return Verdict(entry, "broken", complaint)
-    if entry.distribution == OWN or entry.api:
-        return Verdict(entry, "fine")
+    if hint or entry.distribution == OWN or entry.api:
+        return Verdict(entry, "fine", hint=hint)
     hint = (
         f"{entry.distribution} declares no version of cfx's plugin API and counts as built for the"
         " current one; its author can add to pyproject.toml:"
         f' [project.entry-points."{registry.API_GROUP}"] {API_VERSION} = "{entry.package}"'
     )
     return Verdict(entry, "fine", hint=hint)
+
+
+def _not_tried(entry: registry.Entry, cls: type[Component]) -> str:
+    """Returns why a component cannot be tried; "" if it can."""
+    required = []
+    for name, field in cls.schema.model_fields.items():
+        if registry.is_blank(field):
+            required.append(f"{registry.kind_of(entry.kind).group}.{name}")
+    if not required:
+        return ""
+    keys = ", ".join(required)
+    return f"{entry.kind} '{entry.name}' was loaded but not tried: it needs {keys}."
 
 
 def _shadow(entry: registry.Entry) -> str:

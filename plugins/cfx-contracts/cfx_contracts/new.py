@@ -130,6 +130,9 @@ def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
     return {
         "kind": kind.name,
         "group": kind.group,
+        "usage": _usage(kind, name),
+        "has_presets": any((_TEMPLATE / kind.name).rglob("*.yaml.jinja")),
+        "has_contract": kind.name in registry.KINDS,
         "entry_points": kind.entry_points,
         "name": name,
         "class_name": class_name,
@@ -141,12 +144,21 @@ def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
     }
 
 
-def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:
-    job = kind.call(name).removeprefix("cfx ")
+def _usage(kind: registry.Kind, name: str) -> str:
+    """Returns what a user types to see a component at work."""
+    if kind.name == "figure":
+        return "python -m cfx  # every job that has what it shows draws it"
+    arguments = kind.call(name).removeprefix("cfx ")
+    if kind.name in {"metric", "table"}:
+        arguments = f"{kind.group}{'' if kind.name == 'metric' else 's'}=[own,{name}]"
     if kind.name == "dataset":
-        job += " data.path=FILE.csv"
-    if kind.name == "metric":
-        job = f"metrics=[own,{name}]"
+        arguments += " data.path=FILE.csv"
+    if kind.name == "command":
+        arguments += " --help"
+    return f"python -m cfx {arguments}"
+
+
+def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:
     folder = shlex.quote(str(target))
     package = shlex.quote(f"{target}[test]")
     return (
@@ -154,5 +166,5 @@ def _next_steps(kind: registry.Kind, name: str, target: Path) -> str:
         f"  pip install --editable {package}\n"
         f"  python -m pytest {folder}\n"
         f"  python -m cfx plugins check {kind.name} {name}\n"
-        f"  python -m cfx {job}"
+        f"  {_usage(kind, name)}"
     )

@@ -12,7 +12,7 @@ from cfx_sumo.live.driver import Driver
 from cfx_sumo.live.fleet import Fleet
 from tests.agents import adaptive
 from tests.forks import Forks
-from tests.sumo.test_driver import Road, platoon
+from tests.road import Road, platoon
 
 pytest.importorskip("traci", reason="needs the extra sumo")
 

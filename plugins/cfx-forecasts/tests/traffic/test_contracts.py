@@ -9,8 +9,9 @@ import pytest
 
 from cfx_contracts import check_contract
 from cfx_forecasts.traffic.protocol import TrafficProtocol
-from tests.evaluation.protocols.test_finished import drawn, job
 from tests.evaluation.protocols.test_transfer import HERE
+
+from ..test_finished import drawn, job
 
 __all__ = ["drawn"]  # pytest finds it here
 

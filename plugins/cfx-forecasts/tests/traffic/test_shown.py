@@ -11,16 +11,17 @@ import pandas as pd
 import pytest
 
 from cfx.figures.figure import Results, draw_figure, figure_named
-from cfx.figures.text import MINUS, method_label
+from cfx.figures.text import MINUS, colour_of, method_label
 from cfx_forecasts.traffic.figures import draw_paths, draw_traffic, path_panels, traffic_panels
 from cfx_forecasts.traffic.section import traffic_sheet
 from cfx_forecasts.traffic.summary import traffic_methods, traffic_metrics
 from cfx_forecasts.traffic.tables import ROAD_COLUMNS
+from cfx_report.page import render
 from cfx_report.runs import read_runs
+from tests.drawn import drawn_lines
+from tests.job_folders import write_job
 from tests.made_up import make_results
-from tests.report.figures.test_shown import colour_of, drawn_lines
-from tests.report.folders import write_job
-from tests.report.test_comparison import page_of
+from tests.pages import Page
 
 
 def make_traffic(
@@ -90,7 +91,7 @@ def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
     (tmp_path / "job" / "metrics.json").write_text(
         json.dumps({key: value if math.isfinite(value) else None for key, value in found.items()})
     )
-    page = page_of(tmp_path)
+    page = Page(render(read_runs([str(tmp_path)])))
     assert "traffic" in page.having("id")
     (job,) = read_runs([str(tmp_path)]).jobs
     sheet = traffic_sheet(job, roads)

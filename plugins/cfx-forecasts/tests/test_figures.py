@@ -1,0 +1,108 @@
+"""Figures of forecasts show the numbers that were chosen."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from cfx.figures.figure import Results, draw_figure, figure_named
+from cfx.figures.text import colour_of
+from cfx_forecasts.distributions import centre_errors, summarize_distributions
+from cfx_forecasts.errors import errors_by_history, forecast_methods, summarize_forecasts
+from cfx_forecasts.figures import (
+    draw_by_history,
+    draw_by_horizon,
+    draw_distributions,
+    draw_errors,
+    errors_over_time,
+    pit_density,
+)
+from tests.drawn import drawn_lines, texts
+from tests.made_up import (
+    make_distributions,
+    make_forecasts,
+    make_results,
+)
+
+
+def test_forecasts_have_a_line_per_method() -> None:
+    forecasts = make_forecasts()
+    summary, methods = summarize_forecasts(forecasts, 0), forecast_methods(forecasts)
+    by_horizon = draw_by_horizon(summary, methods).axes
+    for axes, error in zip(by_horizon, ("rmse_speed", "rmse_position"), strict=True):
+        assert axes.get_yscale() == "log"
+        lines = drawn_lines(axes)
+        assert len(lines) == len(methods)
+        for method in methods:
+            rows = summary[summary["method"] == method].sort_values("horizon_s")
+            np.testing.assert_allclose(lines[colour_of(method)].get_ydata(), rows[error])
+
+
+def test_longer_histories_stand_to_the_right() -> None:
+    by_history = errors_by_history(make_forecasts())
+    figure = draw_by_history(by_history, ["policy"])
+    assert len(figure.axes) == 3
+    assert figure.axes[-1].get_ylabel().startswith("RMSE of speed after 10 s")
+    (line,) = figure.axes[0].lines
+    assert bool((np.diff(line.get_xdata()) > 0).all())
+    assert bool((np.diff(line.get_ydata()) < 0).all())
+
+
+def test_distributions_have_lines_and_histograms() -> None:
+    forecasts = make_forecasts()
+    table = make_distributions(forecasts)
+    crps, coverage, pit = draw_distributions(table, forecasts).axes
+    summary = summarize_distributions(table)
+    shown = {"population_ar": "population_ar", "fixed_ar": "fixed_ar", "policy": "policy_sampled"}
+    for axes, column in ((crps, "crps_speed"), (coverage, "coverage")):
+        lines = drawn_lines(axes)
+        for method, name in shown.items():
+            rows = summary[summary["method"] == method].sort_values("horizon_s")
+            np.testing.assert_allclose(lines[colour_of(name)].get_ydata(), rows[column])
+    centre = centre_errors(forecasts)["crps_speed"]
+    np.testing.assert_allclose(drawn_lines(crps)[colour_of("policy")].get_ydata(), centre)
+    assert pit.get_ylabel() == "density, 2 s ahead"
+    here = table[table["horizon_s"] == 2.0]
+    for method, patch in zip(shown, pit.patches, strict=True):
+        density = pit_density(here[here["method"] == method])
+        assert density.mean() == pytest.approx(1.0)
+        np.testing.assert_allclose(patch.get_data().values, density)
+
+
+def test_errors_over_time_show_where_the_transient_ends() -> None:
+    evaluation = make_results(pairs=5, frames=80).evaluation
+    figure = draw_errors(evaluation.trajectories, evaluation.methods, 5.0)
+    for axes, signal in zip(figure.axes, ("speed", "gap"), strict=True):
+        lines = drawn_lines(axes)
+        for method in evaluation.methods:
+            _, error = errors_over_time(evaluation.trajectories, method, signal)
+            np.testing.assert_allclose(lines[colour_of(method)].get_ydata(), error)
+        assert [5.0, 5.0] in [list(line.get_xdata()) for line in axes.lines]
+
+
+def test_errors_over_time_are_those_of_the_pairs_that_still_drive() -> None:
+    drives = make_results(pairs=4, frames=30).evaluation.trajectories
+    shortened = [
+        dataclasses.replace(
+            d,
+            time=d.time[:11],
+            real_speed=d.real_speed[:11],
+            speed={"policy": d.speed["policy"][:11]},
+        )
+        for d in drives[:1]
+    ]
+    seconds, error = errors_over_time(drives, "policy", "speed")
+    expected = np.sqrt(np.mean([(d.speed["policy"] - d.real_speed) ** 2 for d in drives], axis=0))
+    np.testing.assert_allclose(error, expected)
+    assert seconds[0] == 0
+    assert error[0] == 0
+    seconds, _ = errors_over_time(
+        [shortened[0], *drives[1:]], "policy", "speed"
+    )  # three of four are not nearly all
+    assert len(seconds) == 11
+    results = Results.of(make_results(pairs=3).evaluation)
+    figure = draw_figure(figure_named("error_over_time"), results)
+    assert figure is not None
+    assert "time since the test part began" in texts(figure)

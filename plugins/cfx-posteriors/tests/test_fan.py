@@ -1,0 +1,39 @@
+"""Fans of trajectories hold what happens as often as they say."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import pytest
+import torch
+
+from cfx.models.krauss import Krauss
+from cfx_posteriors.fan import fan_of
+
+from .recordings import draw_recordings
+
+SHARES = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
+
+
+@pytest.mark.parametrize("signal", ["speed", "gap"])
+def test_with_true_parameters_a_forecast_holds_nine_in_ten(
+    signal: Literal["speed", "gap"],
+) -> None:
+    drawn = draw_recordings(Krauss(), 150, signal=signal, seed=2)
+    true = drawn.truth[:, None].expand(-1, 200, -1)
+    frame = torch.full((150,), 305)
+    found, alone = (
+        fan_of(drawn.posterior, frame, true, SHARES, seed=0, memory=memory)
+        for memory in (1 << 30, 1)
+    )
+    torch.testing.assert_close(found.quantiles, alone.quantiles)
+    assert found.time[:2].tolist() == [1.0, 2.0]
+    table = found.table([f"p{number}" for number in range(150)])
+    assert table["calibrated_on"].sum() == 150 * 30
+    simulated = table[table["calibrated_on"]]
+    assert (simulated["low"] == simulated["high"]).all(), "one trajectory, without noise"
+    ahead = table[~table["calibrated_on"]]
+    held = (ahead["low"] <= ahead["measured"]) & (ahead["measured"] <= ahead["high"])
+    assert 0.85 < held.mean() < 0.95
+    error = (ahead["median"] - ahead["measured"]).abs().groupby(ahead["time_s"]).median()
+    assert error[31.0] < error[58.0], "doubt grows"
