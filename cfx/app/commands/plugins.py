@@ -17,6 +17,7 @@ from cfx.core import registry
 from cfx.core.command import Command
 from cfx.core.component import Component
 from cfx.core.console import blank_table, print_table
+from cfx.core.distributions import OWN
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -119,12 +120,13 @@ def _use(entry: registry.Entry, cls: Any) -> str:
     if entry.kind == "command":
         return f"Run it with cfx {name}; cfx {name} --help says what it takes."
     if entry.kind == "table":
-        return f"tables=[own,{name}] writes {name}{cls.suffix} where a job has rows of it."
+        who = "Every job" if entry.distribution == OWN else f"A job with tables=[own,{name}]"
+        return f"{who} writes {name}{cls.suffix} where it has rows of it."
     if entry.kind == "figure":
         return f"Every job that has what it shows draws it: figures/{name}.png."
     if entry.kind == "metric":
-        choice = kind.call(name)
-        return f"metrics=[own,{name}] measures it; {choice} only what jobs need beside it."
+        who = "Every job" if entry.distribution == OWN else f"A job with metrics=[own,{name}]"
+        return f"{who} measures it; with {kind.call(name)} no others but those that a job needs."
     return f"Choose it with {kind.call(name)}."
 
 
