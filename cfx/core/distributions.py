@@ -105,7 +105,7 @@ def advice(group: str, name: str, known: Sequence[str]) -> str:
 def install_line(wanted: str) -> str:
     """Returns the command that installs a distribution, or an extra of cfx's, for this Python.
 
-    In a checkout it is the folder's: `pip install --editable plugins/cfx-classics`.
+    In a checkout it is the folder's: `pip install --editable plugins/cfx-community`.
     """
     name, bracket, extra = wanted.partition("[")
     checkout = Path(__file__).resolve().parents[2]
