@@ -15,6 +15,7 @@ import torch
 import yaml
 
 import cfx
+import cfx_report.section  # noqa: F401 - adds the kind of sections
 from cfx.app.hydra_source import composed
 from cfx.core import registry
 from cfx.data.tidy import write_tidy
