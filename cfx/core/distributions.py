@@ -22,6 +22,9 @@ from cfx.errors import nearest
 OWN = "cfx-driving"
 """cfx's own distribution: no other can replace its components."""
 
+ALL_OWN = "own"
+"""Stands for all metrics, or tables, of cfx itself where a job names some."""
+
 FILE = Path(__file__).with_name("distributions.json")
 
 

@@ -90,15 +90,15 @@ def named_distributions(values: Mapping[str, Any]) -> dict[str, str]:
         PluginError: there is no metric, or no table, of that name.
     """
     from cfx.core import registry
-    from cfx.core.distributions import OWN
-    from cfx.evaluation.metrics.base import OWN_METRICS, entries_of
+    from cfx.core.distributions import ALL_OWN, OWN
+    from cfx.evaluation.metrics.base import entries_of
 
-    entries = list(entries_of(values.get("metrics", OWN_METRICS)))
-    tables = values.get("tables", OWN_METRICS)
+    entries = list(entries_of(values.get("metrics", ALL_OWN)))
+    tables = values.get("tables", ALL_OWN)
     if tables == "all":
         entries += registry.entries("table")
     elif not isinstance(tables, str):
-        entries += [registry.entry("table", name) for name in tables if name != OWN_METRICS]
+        entries += [registry.entry("table", name) for name in tables if name != ALL_OWN]
     return {one.distribution: one.version for one in entries if one.distribution != OWN}
 
 

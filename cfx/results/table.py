@@ -24,7 +24,7 @@ import pyarrow.parquet as pq
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.distributions import OWN
+from cfx.core.distributions import ALL_OWN, OWN
 from cfx.core.job_folder import unreadable
 from cfx.core.memory import in_units, total_memory
 from cfx.errors import DataError, PluginError
@@ -241,12 +241,12 @@ def chosen_tables(
     if chosen == "all":
         return installed()
     names = {chosen} if isinstance(chosen, str) else set(chosen)
-    for name in names - {"own"}:
+    for name in names - {ALL_OWN}:
         registry.get("table", name)
     tables = []
     for one in installed():
         is_own = one.distribution == OWN or one.distribution in plugins
-        if one.name in names or ("own" in names and is_own):
+        if one.name in names or (ALL_OWN in names and is_own):
             tables.append(one)
     return tuple(tables)
 

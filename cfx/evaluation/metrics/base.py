@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.distributions import OWN
+from cfx.core.distributions import ALL_OWN, OWN
 from cfx.errors import PluginError
 
 if TYPE_CHECKING:
@@ -193,9 +193,6 @@ def column_of(metric: str, scope: str = "test") -> str:
     return f"{scope}_{metric}"
 
 
-OWN_METRICS = "own"
-"""Stands for all metrics of cfx itself where names are given."""
-
 ALWAYS = ("rmse_speed", "rmse_gap", "collisions")
 """Measured in every job: the comparison of methods, the figures and the reports rest on them."""
 
@@ -253,7 +250,7 @@ class MetricSet:
     left_out: tuple[LeftOut, ...] = field(default=())
 
     @classmethod
-    def of(cls, chosen: str | Sequence[str] = OWN_METRICS) -> MetricSet:
+    def of(cls, chosen: str | Sequence[str] = ALL_OWN) -> MetricSet:
         """Makes the metrics that are chosen, and those that every job measures.
 
         Args:
@@ -279,7 +276,7 @@ class MetricSet:
         return cls(_ordered([_made(one) for one in entries if one.distribution == OWN]))
 
 
-def entries_of(chosen: str | Sequence[str] = OWN_METRICS) -> tuple[registry.Entry, ...]:
+def entries_of(chosen: str | Sequence[str] = ALL_OWN) -> tuple[registry.Entry, ...]:
     """Returns the entries of the metrics that a job measures; imports none.
 
     Args:
@@ -292,8 +289,8 @@ def entries_of(chosen: str | Sequence[str] = OWN_METRICS) -> tuple[registry.Entr
     if chosen == "all":
         return tuple(usable)
     names = {*ALWAYS, *([chosen] if isinstance(chosen, str) else chosen)}
-    if OWN_METRICS in names:
-        names.remove(OWN_METRICS)
+    if ALL_OWN in names:
+        names.remove(ALL_OWN)
         names.update(one.name for one in usable if one.distribution == OWN)
     return tuple(registry.entry("metric", name) for name in sorted(names))
 

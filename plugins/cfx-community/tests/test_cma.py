@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 import torch
 
@@ -75,29 +73,3 @@ def test_a_budget_smaller_than_the_first_evaluations_is_kept(samples: int) -> No
 def test_more_guesses_than_first_evaluations_is_told() -> None:
     with pytest.raises(ConfigError, match=r"there are 3 first guesses; set optimizer\.initial"):
         CmaOptimizer(initial=2).minimize(Problems(valley, random(1, 2)), random(1, 3, 2), seed=0)
-
-
-def test_cfx_recovers_known_drivers_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Drivers whose parameters are constant and known, calibrated by a whole job."""
-    monkeypatch.chdir(tmp_path)
-    options = ["data.pairs=3", "data.platoon_size=1", "data.variation=0", "data.frames=400"]
-    result = cfx.run(
-        [
-            "optimizer=cma",
-            "model=krauss",
-            "policy=fixed",
-            "protocol=within_driver",
-            "data=synthetic",
-            *options,
-            "calibration.prior=none",
-            "tracking.enabled=false",
-            "figures.enabled=false",
-        ]
-    )
-    truth = cfx.get("dataset", "synthetic")(pairs=3, platoon_size=1, variation=0, frames=400).load()
-    found = result.pairs[result.pairs.method == "fixed"].set_index("pair_id").parameter_t_r
-    for pair in truth:
-        assert found[pair.pair_id] == pytest.approx(pair.truth["t_r"][0], abs=0.05)
-    assert result.metrics["rmse_speed/fixed"] < 0.01 * result.metrics["rmse_speed/default"]

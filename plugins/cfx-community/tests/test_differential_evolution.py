@@ -1,13 +1,10 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 from scipy.optimize import differential_evolution
 
-import cfx
 from cfx.errors import ConfigError
 from cfx_community.optimizers.differential_evolution import DifferentialEvolution
 from cfx_contracts import check_contract
@@ -95,28 +92,3 @@ def test_more_guesses_than_the_population_is_told() -> None:
 def test_the_mutation_weights_must_be_in_order() -> None:
     with pytest.raises(ConfigError, match="mutation_low"):
         DifferentialEvolution(mutation_low=1.2, mutation_high=0.5)
-
-
-def test_cfx_recovers_known_drivers_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Drivers whose parameters are constant and known, calibrated by a whole job."""
-    monkeypatch.chdir(tmp_path)
-    options = ["data.pairs=3", "data.platoon_size=1", "data.variation=0", "data.frames=400"]
-    result = cfx.run(
-        [
-            "optimizer=differential_evolution",
-            "model=krauss",
-            "policy=fixed",
-            "protocol=within_driver",
-            "data=synthetic",
-            *options,
-            "tracking.enabled=false",
-            "figures.enabled=false",
-        ]
-    )
-    truth = cfx.get("dataset", "synthetic")(pairs=3, platoon_size=1, variation=0, frames=400).load()
-    found = result.pairs[result.pairs.method == "fixed"].set_index("pair_id").parameter_t_r
-    for pair in truth:
-        assert found[pair.pair_id] == pytest.approx(pair.truth["t_r"][0], abs=0.05)
-    assert result.metrics["rmse_speed/fixed"] < 0.01 * result.metrics["rmse_speed/default"]
