@@ -19,13 +19,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from cfx.learners.rollout.dataset import Conditioning, RolloutBatch, RolloutDataset
-from cfx.learners.rollout.scan import Scan
 from cfx.learners.rollout.window import (
     GradientPath,
     LeaderWindow,
@@ -87,6 +86,31 @@ class Expert:
         return speeds, state._replace(memory=after.memory, state=after.state)
 
 
+class CompiledLoop(Protocol):
+    """What compiled code does instead of this module, as `cfx.learners.compiled` makes it."""
+
+    def trajectories(
+        self,
+        dataset: RolloutDataset,
+        batch: RolloutBatch,
+        windows: int,
+        burn_in_windows: int | None,
+    ) -> Segment:
+        """Returns what `simulate` yields without `path`."""
+        ...
+
+    def gradients(
+        self,
+        dataset: RolloutDataset,
+        batch: RolloutBatch,
+        windows: int,
+        path: GradientPath,
+        burn_in_windows: int | None,
+    ) -> Iterator[Segment]:
+        """Yields what `simulate` does with `path`."""
+        ...
+
+
 def burn_in(
     step: WindowStep,
     dataset: RolloutDataset,
@@ -126,7 +150,7 @@ def simulate(
     burn_in_windows: int | None = None,
     expert: Expert | None = None,
     noise: Tensor | None = None,
-    scan: Scan | None = None,
+    compiled: CompiledLoop | None = None,
 ) -> Iterator[Segment]:
     """Simulates trajectories in closed loop.
 
@@ -141,14 +165,17 @@ def simulate(
         noise: what a stochastic head draws from, `(H, N, paths D, k)`; None: nothing is drawn. Each
             path of all trajectories stands behind the one before. What was measured is observed
             once for all.
-        scan: the window as compiled code, which simulates where no expert is asked and nothing is
-            drawn; None: none.
+        compiled: the window as compiled code, which simulates where no expert is asked and nothing
+            is drawn; None: none.
 
     Yields:
         What was simulated between two cuts of the gradients.
     """
-    if scan is not None and expert is None and noise is None:
-        yield from scan.simulate(dataset, batch, windows, path, burn_in_windows)
+    if compiled is not None and expert is None and noise is None:
+        if path is None:
+            yield compiled.trajectories(dataset, batch, windows, burn_in_windows)
+        else:
+            yield from compiled.gradients(dataset, batch, windows, path, burn_in_windows)
         return
     state = burn_in(step, dataset, batch, dataset.condition(batch), burn_in_windows)
     paths = 1 if noise is None else noise.shape[2] // batch.place.shape[1]

@@ -25,10 +25,9 @@ from torch.utils.data import DataLoader
 from cfx.core.engine import Report
 from cfx.learners.batched import BatchedModule, fit
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
-from cfx.learners.rollout.loop import Expert, simulate
+from cfx.learners.rollout.loop import CompiledLoop, Expert, simulate
 from cfx.learners.rollout.loss import Divisors, FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
-from cfx.learners.rollout.scan import Scan
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import TrainedShard, TrainingShard, untrained
 from cfx.learners.rollout.window import GradientPath, WindowStep
@@ -99,7 +98,7 @@ class RolloutModule(BatchedModule):
         if settings.temperature > 0:
             model = model.at_temperature(self.temperature)
         self.training_window = WindowStep(core, model, windows, dt)
-        self.scans: dict[WindowStep, Scan] = {}
+        self.compiled: dict[WindowStep, CompiledLoop] = {}
         if self._is_worth_compiling():
             self._compile()
         self.loss = TrajectoryLoss(training_data.objective, settings, dt)
@@ -209,7 +208,7 @@ class RolloutModule(BatchedModule):
             burn_in_windows=None if path is None else self.burn_in_windows,
             expert=expert,
             noise=noise,
-            scan=self.scans.get(step),
+            compiled=self.compiled.get(step),
         )
         centre = slice(None, batch.place.shape[1])
         for segment in segments:
@@ -389,27 +388,38 @@ class RolloutModule(BatchedModule):
 
     def _compile(self) -> None:
         """Compiles the windows of training and of validation."""
-        exact, window = self.exact_step, self.training_window
-        temperature = self.temperature if self.settings.temperature > 0 else None
-        if self.dataset.base.device.type == "cpu":
-            key = window.key()
-            try:
-                scans = {window: Scan(window, temperature, key, trains=True)}
-                scans[exact] = Scan(exact, None, key, trains=False)
-                Scan.compile(list(scans.values()))
-            except Unsupported as reason:
-                log.info("Training has no compiled loop (%s); PyTorch compiles a window", reason)
-            else:
-                self.scans = scans
-                if not self.is_stochastic and not self.settings.distillation_epochs:
-                    return
-        window.compile()
+        s = self.settings
+        if s.compile != "torch" and self.dataset.base.device.type == "cpu":
+            temperature = self.temperature if s.temperature > 0 else None
+            self.compiled = _compiled_loops(self.training_window, temperature, self.exact_step)
+        # Sampled paths and experts go window by window.
+        goes_by_windows = self.is_stochastic or s.distillation_epochs > 0
+        if not self.compiled or goes_by_windows:
+            self.training_window.compile()
 
     def _is_worth_compiling(self) -> bool:
         s = self.settings
         if s.compile == "never" or not can_compile(self.dataset.base.device):
             return False
         return s.compile == "always" or s.epochs * s.steps * s.horizon >= _WORTH_COMPILING
+
+
+def _compiled_loops(
+    training: WindowStep, temperature: Tensor | None, validation: WindowStep
+) -> dict[WindowStep, CompiledLoop]:
+    """Returns whole trajectories as compiled code, by window; none where there can be none."""
+    try:
+        from cfx.learners.compiled import compile_windows
+    except ModuleNotFoundError as missing:
+        if missing.name != "cfx.learners.compiled":
+            raise
+        log.info("cfx.learners.compiled is not there; PyTorch compiles a window of training")
+        return {}
+    try:
+        return dict(compile_windows(training, temperature, validation))
+    except Unsupported as reason:
+        log.info("Training has no compiled loop (%s); PyTorch compiles a window", reason)
+        return {}
 
 
 def train(shard: TrainingShard, report: Report) -> TrainedShard:
@@ -435,7 +445,7 @@ def _trained(shard: TrainingShard, report: Report) -> RolloutModule:
     if shard.expert is not None:
         taught = _trained(shard.expert, report)
         taught.network.requires_grad_(False)
-        if taught.scans:
+        if taught.compiled:
             # Experts say one window at a time what they would do.
             taught.training_window.compile()
         expert = Expert(taught.training_window, taught.dataset)

@@ -21,17 +21,12 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.calibration import losses
-from cfx.core import parameters
-from cfx.core.component import folder_hash
 from cfx.data.pairs import PairBatch
 from cfx.learners.rollout.dataset import RolloutBatch
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.policies import features
 from cfx.policies.core import AgentCore
 from cfx.policies.features import History
 from cfx.simulation.kernel.compiler import torch_compiled
-from cfx.simulation.kernel.run import component_code
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.windows import WindowSettings
 
@@ -97,19 +92,6 @@ class WindowStep:
         # The compiled functions take the methods' places.
         self.observe = torch_compiled(self.observe, dynamic=False)  # type: ignore[method-assign]
         self.drive_window = torch_compiled(self.drive_window, dynamic=False)  # type: ignore[method-assign]
-
-    def key(self) -> object:
-        """Returns what the window depends on besides tensors; None if only this process knows."""
-        core = self.core
-        code = []
-        for component in (type(self.model), type(core.head), type(core.policy)):
-            code.append(component_code(component))
-        if None in code:
-            return None
-        settings = [self.model.equations_key(), repr(self.space), self.length, self.stride, self.dt]
-        read = [core.inputs, core.summary, core.scaler.mean.shape[-1]]
-        rooms = [folder_hash(module.__file__) for module in (features, parameters, losses)]
-        return [code, settings, read, rooms, folder_hash(__file__)]
 
     def observe(
         self, token: Tensor, conditioning: Tensor, state: Tensor, present: Tensor

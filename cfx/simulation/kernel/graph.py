@@ -56,7 +56,7 @@ def parameter_names(count: int) -> tuple[str, ...]:
 class Statement(NamedTuple):
     """One operation: `name = expression`, a number or (`is_condition`) true or false.
 
-    `cfx.simulation.kernel.elementwise` differentiates `operation` by its `operands`.
+    `cfx.learners.compiled` differentiates `operation` by its `operands`.
     """
 
     name: str
@@ -122,9 +122,9 @@ def record(
         added = terms.function(after.speed, gap, *measured)
         return (after.position, after.speed, after.acceleration, after.memory, *added)
 
-    graph = _traced(step, last + width, dtype)
+    graph = traced(step, last + width, dtype)
     names = [*INPUTS, *parameter_names(len(parameters)), *memory_names(width)]
-    statements, (position, speed, acceleration, memory, *added) = _Recording(names).function(graph)
+    statements, (position, speed, acceleration, memory, *added) = Recording(names).function(graph)
     if len(memory) != width:
         raise Unsupported("a memory that changes its width")
     state = (position[0], speed[0], acceleration[0])
@@ -140,74 +140,27 @@ def record_terms(terms: Terms, dtype: torch.dtype) -> None:
         Unsupported: as `record`.
     """
     names = INPUTS[:4]
-    _Recording(names).function(_traced(terms.function, len(names), dtype))
+    Recording(names).function(traced(terms.function, len(names), dtype))
 
 
-def _traced(
-    function: Callable[..., Sequence[Tensor]], inputs: int, dtype: torch.dtype, simpler: Any = None
+def traced(
+    function: Callable[..., Sequence[Tensor]],
+    inputs: int,
+    dtype: torch.dtype,
+    decompositions: Any = None,
 ) -> fx.Graph:
     """Returns the operations of a function of so many tensors `(V,)`."""
     from torch.fx.experimental.proxy_tensor import make_fx
 
     examples = [torch.full((VEHICLES,), 1.0 + number, dtype=dtype) for number in range(inputs)]
     try:
-        graph: fx.Graph = make_fx(function, simpler)(*examples).graph
+        graph: fx.Graph = make_fx(function, decompositions)(*examples).graph
     except Exception as error:
         raise Unsupported(f"recording it failed ({type(error).__name__})") from error
     return graph
 
 
-class Program(NamedTuple):
-    """An elementwise function, as C++ expressions over the columns of its inputs.
-
-    Attributes:
-        inputs: names of the columns of each input.
-        statements: in order.
-        outputs: expressions of the columns of each output.
-    """
-
-    inputs: tuple[tuple[str, ...], ...]
-    statements: tuple[Statement, ...]
-    outputs: tuple[tuple[str, ...], ...]
-
-
-def record_function(
-    function: Callable[..., Sequence[Tensor]], widths: Sequence[int], dtype: torch.dtype
-) -> Program:
-    """Records an elementwise function of tensors `(V, width)`.
-
-    Args:
-        function: pure; returns such tensors.
-        widths: of its arguments, at least 1 each.
-        dtype: of all values.
-
-    Raises:
-        Unsupported: as `record`.
-    """
-    from torch._decomp import get_decompositions
-
-    names: list[tuple[str, ...]] = []
-    for number, width in enumerate(widths):
-        names.append(tuple(f"in{number}_{column}" for column in range(width)))
-
-    def of_columns(*values: Tensor) -> Sequence[Tensor]:
-        arguments, first = [], 0
-        for width in widths:
-            arguments.append(torch.stack(values[first : first + width], -1))
-            first += width
-        return function(*arguments)
-
-    flat = list(itertools.chain(*names))
-    wanted = (torch.ops.aten.logit, torch.ops.aten.lerp, torch.ops.aten.std)
-    simpler: Any = get_decompositions(wanted)
-    graph = _traced(of_columns, len(flat), dtype, simpler)
-    if any(operation_of(node) == "detach" for node in graph.nodes):
-        raise Unsupported("a gradient that is cut")
-    statements, outputs = _Recording(flat).function(graph)
-    return Program(tuple(names), statements, outputs)
-
-
-class _Recording:
+class Recording:
     """Turns a recorded graph into statements."""
 
     def __init__(self, inputs: Sequence[str]) -> None:
