@@ -180,7 +180,7 @@ class SegmentLosses:
         """Whether losses come from a compiled kernel, given enough work, without trajectories."""
         space = self.simulator.model.space
         defaults = space.to_unit(space.defaults()).to(self.device)
-        return self.simulator.accumulates(self.parameters(defaults[None, None]), self._terms)
+        return self.simulator.accumulates(self.parameters(defaults[None, None]), self.terms)
 
     def for_work(self, candidates: int) -> SegmentLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
@@ -213,7 +213,7 @@ class SegmentLosses:
         else:
             p = candidates
         counted = self.segments.counted
-        sums = self.simulator.accumulate(self.segments, p, self._terms)
+        sums = self.simulator.accumulate(self.segments, p, self.terms)
         if sums is not None:
             losses = self.objective.finish(sums, counted.sum(0).clamp(min=1)[:, None])
         else:
@@ -247,7 +247,9 @@ class SegmentLosses:
         )
 
     @property
-    def _terms(self) -> Terms:
+    def terms(self) -> Terms:
+        """What one frame adds to the sums of the objective."""
+
         def of_frame(
             v: Tensor, gap: Tensor, v_real: Tensor, gap_real: Tensor
         ) -> tuple[Tensor, ...]:
