@@ -220,7 +220,7 @@ class Fit:
             agent = context.constant(FixedPolicy(), parameters)
             each = torch.arange(len(batch), device=batch.lengths.device)
             loop = simulate_in_shards(
-                context.engine, context.simulator, agent, Followers(batch, each), first
+                context.engine, context.stepper, agent, Followers(batch, each), first
             )
             speed, gap = closed_loop_errors(batch, first, loop)
             errors |= {"test_rmse_speed": speed, "test_rmse_gap": gap}

@@ -152,7 +152,7 @@ def forecast(
         network = torch.zeros_like(origins.pair)
         followers = Followers(context.batch, network, base, agent.context_rule.history_s)
         found = sample_from_origins(
-            context.simulator,
+            context.stepper,
             agent,
             followers,
             origins,

@@ -392,8 +392,8 @@ class Calibrator:
         Whether work is compiled depends on how much there is, and its last bits on that: `steps`
         of all problems of the group, for one candidate.
         """
-        simulator = self.solver.simulator.for_work(steps * self.solver.optimizer.evaluations())
-        return replace(self.solver, simulator=simulator)
+        stepper = self.solver.stepper.for_work(steps * self.solver.optimizer.evaluations())
+        return replace(self.solver, stepper=stepper)
 
     @cached_property
     def _scope(self) -> dict[str, Any]:

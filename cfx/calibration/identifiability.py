@@ -105,7 +105,7 @@ def losses_of(
     for own in torch.split(torch.arange(len(batch), device=candidates.device), _PAIRS_AT_ONCE):
         first, end = torch.zeros_like(own), last.to(own.device)[own]
         segments = SegmentLosses.of_segments(
-            calibrator.solver.simulator, objective, batch, own, first, end
+            calibrator.solver.stepper, objective, batch, own, first, end
         )
         per_pair = segments.bytes_per_candidate * candidates.shape[1]
         size = max(1, calibrator.solver.memory // max(1, per_pair))

@@ -92,13 +92,13 @@ class SegmentLosses:
     Each segment starts from a measured state behind its measured leader and lasts up to K steps.
 
     Attributes:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         objective: compares the simulated segment with the measured one.
         segments: what was measured, K steps of P segments.
         prior: added to the losses of candidates in unit space; None: none.
     """
 
-    simulator: Stepper
+    stepper: Stepper
     objective: Objective
     segments: Segments
     prior: Prior | None = None
@@ -106,7 +106,7 @@ class SegmentLosses:
     @classmethod
     def of_segments(
         cls,
-        simulator: Stepper,
+        stepper: Stepper,
         objective: Objective,
         batch: PairBatch,
         pair: Tensor,
@@ -116,7 +116,7 @@ class SegmentLosses:
         """Cuts segments out of pairs.
 
         Args:
-            simulator: the model and its time step.
+            stepper: the model and its time step.
             objective: compares the simulated segments with the measured ones.
             batch: the pairs.
             pair: `(P,)`, index of each segment's pair in the batch.
@@ -140,7 +140,7 @@ class SegmentLosses:
             speed=batch.follower_speed[pair, first],
             acceleration=batch.follower_acceleration[pair, first],
         )
-        return cls(simulator, objective, segments)
+        return cls(stepper, objective, segments)
 
     @property
     def problems(self) -> int:
@@ -165,7 +165,7 @@ class SegmentLosses:
         positions, speeds, a term, its masked copy and the intermediate values of one block; a gap
         is another value with another term.
         """
-        parameters = len(self.simulator.model.space.names)
+        parameters = len(self.stepper.model.space.names)
         if self.accumulates:
             values = 3 * parameters + 8
         elif "gap" in self.objective.signals:
@@ -178,14 +178,14 @@ class SegmentLosses:
     @property
     def accumulates(self) -> bool:
         """Whether losses come from a compiled kernel, given enough work, without trajectories."""
-        space = self.simulator.model.space
+        space = self.stepper.model.space
         defaults = space.to_unit(space.defaults()).to(self.device)
-        return self.simulator.accumulates(self.parameters(defaults[None, None]), self.terms)
+        return self.stepper.accumulates(self.parameters(defaults[None, None]), self.terms)
 
     def for_work(self, candidates: int) -> SegmentLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
         steps = self.problems * self.steps * candidates
-        return replace(self, simulator=self.simulator.for_work(steps))
+        return replace(self, stepper=self.stepper.for_work(steps))
 
     def select(self, first: int, last: int) -> SegmentLosses:
         """Returns problems `first` to `last - 1`."""
@@ -213,7 +213,7 @@ class SegmentLosses:
         else:
             p = candidates
         counted = self.segments.counted
-        sums = self.simulator.accumulate(self.segments, p, self.terms)
+        sums = self.stepper.accumulate(self.segments, p, self.terms)
         if sums is not None:
             losses = self.objective.finish(sums, counted.sum(0).clamp(min=1)[:, None])
         else:
@@ -234,8 +234,8 @@ class SegmentLosses:
         shape = common_shape([(self.problems, 1), *[value.shape for value in p.values()]])
         start = [value[:, None].expand(shape) for value in (s.position, s.speed, s.acceleration)]
         leader = (s.leader_position, s.leader_speed, s.leader_acceleration, s.leader_length)
-        follower = self.simulator.begin(Start(*start))
-        _, position, speed = self.simulator.advance(
+        follower = self.stepper.begin(Start(*start))
+        _, position, speed = self.stepper.advance(
             follower, Leader(*(value[..., None] for value in leader)), p
         )
         return FrameValues(
@@ -243,7 +243,7 @@ class SegmentLosses:
             gap=s.leader_rear[..., None] - position if gap else speed.new_tensor(torch.nan),
             measured_speed=s.measured_speed[..., None],
             measured_gap=s.measured_gap[..., None],
-            dt=self.simulator.dt,
+            dt=self.stepper.dt,
         )
 
     @property
@@ -253,14 +253,14 @@ class SegmentLosses:
         def of_frame(
             v: Tensor, gap: Tensor, v_real: Tensor, gap_real: Tensor
         ) -> tuple[Tensor, ...]:
-            return self.objective.terms(FrameValues(v, gap, v_real, gap_real, self.simulator.dt))
+            return self.objective.terms(FrameValues(v, gap, v_real, gap_real, self.stepper.dt))
 
         settings = self.objective.settings.model_dump_json()
         return Terms(of_frame, ComponentKey(type(self.objective), settings))
 
     def parameters(self, candidates: Tensor) -> dict[str, Tensor]:
         """Returns candidates `(P, q, n)` in unit space as one tensor per parameter, SI units."""
-        space = self.simulator.model.space
+        space = self.stepper.model.space
         values = space.from_unit(candidates.to(self.segments.measured_speed.dtype))
         return {name: value.contiguous() for name, value in space.unpack(values).items()}
 
@@ -270,13 +270,13 @@ class FullTrajectories:
     """Pairs from frame 0 to a last one, as segments that are cut out where they are simulated.
 
     Attributes:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         objective: compares the simulated trajectories with the measured ones.
         batch: P pairs.
         last: `(P,)`, the last frame that is compared.
     """
 
-    simulator: Stepper
+    stepper: Stepper
     objective: Objective
     batch: PairBatch
     last: Tensor
@@ -300,7 +300,7 @@ class FullTrajectories:
         """Returns pairs of numbers `(S,)` int64; one may stand there more than once."""
         first, last = torch.zeros_like(problems), self.last[problems]
         return SegmentLosses.of_segments(
-            self.simulator, self.objective, self.batch, problems, first, last
+            self.stepper, self.objective, self.batch, problems, first, last
         )
 
 
@@ -361,8 +361,8 @@ class PooledLosses:
     def for_work(self, candidates: int) -> PooledLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
         simulated = int(self.members.sum()) * self.segments.steps
-        simulator = self.segments.simulator.for_work(simulated * candidates)
-        return replace(self, segments=replace(self.segments, simulator=simulator))
+        stepper = self.segments.stepper.for_work(simulated * candidates)
+        return replace(self, segments=replace(self.segments, stepper=stepper))
 
     def select(self, first: int, last: int) -> PooledLosses:
         """Returns problems `first` to `last - 1`."""
@@ -378,8 +378,8 @@ class PooledLosses:
         # none of them is alone.
         simulated = len(used) if shared else int(self.members.sum())
         work = self.segments.steps * simulated * candidates.shape[1]
-        simulator = self.segments.simulator.for_work(work)
-        segments = replace(self.segments, simulator=simulator)
+        stepper = self.segments.stepper.for_work(work)
+        segments = replace(self.segments, stepper=stepper)
         total = candidates.new_zeros(candidates.shape[:2])
         for some in torch.split(used, _SEGMENTS_AT_ONCE):
             members = self.members[:, some]

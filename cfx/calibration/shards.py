@@ -44,7 +44,7 @@ class Solver:
     """The model, optimizer and objective that all problems of a calibration share.
 
     Attributes:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         optimizer: solves the problems.
         seed: the same seed gives the same parameters.
         objective: what is minimised.
@@ -53,7 +53,7 @@ class Solver:
             (`cfx.calibration.losses`); 0: none. Labels have none: ties go to the driver's own set.
     """
 
-    simulator: Stepper
+    stepper: Stepper
     optimizer: Optimizer
     seed: int
     objective: Objective = field(default_factory=SpeedRmse)
@@ -63,13 +63,13 @@ class Solver:
     @property
     def space(self) -> ParameterSpace:
         """The model's parameter space."""
-        return self.simulator.model.space
+        return self.stepper.model.space
 
     def segments(
         self, batch: PairBatch, pair: Tensor, first: Tensor, steps: Tensor
     ) -> SegmentLosses:
         """Returns the losses of segments of pairs; see `SegmentLosses.of_segments`."""
-        return SegmentLosses.of_segments(self.simulator, self.objective, batch, pair, first, steps)
+        return SegmentLosses.of_segments(self.stepper, self.objective, batch, pair, first, steps)
 
     def has_kernel(self, batch: PairBatch) -> bool:
         """Says whether losses come from a compiled kernel where these pairs are."""
@@ -79,11 +79,11 @@ class Solver:
     @property
     def scope(self) -> dict[str, Any]:
         """Everything but the trajectories that results depend on, for keys of the cache."""
-        model = self.simulator.model
+        model = self.stepper.model
         parameters = [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space]
         return {
-            "dt": self.simulator.dt,
-            "simulation": self.simulator.identity(),
+            "dt": self.stepper.dt,
+            "simulation": self.stepper.identity(),
             "calibration": folder_hash(__file__),
             "model": model.identity(),
             "parameters": parameters,
@@ -271,8 +271,8 @@ class PooledShard(CalibrationShard):
     members: Tensor
 
     def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
-        simulator, objective = self.solver.simulator, self.solver.objective
-        trajectories = FullTrajectories(simulator, objective, self.batch, self.last)
+        stepper, objective = self.solver.stepper, self.solver.objective
+        trajectories = FullTrajectories(stepper, objective, self.batch, self.last)
         return PooledLosses(trajectories, self.members, self.solver.memory), None, 0.0
 
 

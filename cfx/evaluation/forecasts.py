@@ -115,7 +115,7 @@ def measured_paths(batch: PairBatch, origins: Origins, steps: int) -> tuple[Path
 
 
 def sample_from_origins(
-    simulator: Stepper,
+    stepper: Stepper,
     agent: Agent,
     followers: Followers,
     origins: Origins,
@@ -131,7 +131,7 @@ def sample_from_origins(
     in chunks that fit the memory.
 
     Args:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         agent: chooses the parameters of each window; of any kind.
         followers: P pairs, and what the agent knows of them; it observes their history before each
             origin.
@@ -159,7 +159,7 @@ def sample_from_origins(
         speed, moved = [], []
         for generator in generators:
             loop = simulate_closed_loop(
-                simulator, agent, known, chunk.frame, state=state, generator=generator
+                stepper, agent, known, chunk.frame, state=state, generator=generator
             )
             position = leader_position - loop.gap
             speed.append(loop.speed)

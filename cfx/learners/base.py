@@ -83,7 +83,7 @@ class TrainingData:
     """What a learner may see: the training part of some pairs.
 
     Attributes:
-        simulator: simulates the driving model, with its time step.
+        stepper: simulates the driving model, with its time step.
         recorded: U pairs, full trajectories; only frames up to `pairs.split.frame` may be read.
         pairs: what is learned from each of P pairs, and by which network.
         windows: how trajectories are cut.
@@ -96,7 +96,7 @@ class TrainingData:
         engine: where independent networks may train.
     """
 
-    simulator: Stepper
+    stepper: Stepper
     recorded: PairBatch
     pairs: TrainingPairs
     windows: WindowSettings

@@ -105,7 +105,7 @@ class ImitationLearner(Learner):
         from cfx.learners.imitation_module import ImitationDataset, ImitationModule
 
         s, device = self.settings, training_data.device
-        head = head_class(s.head).for_model(training_data.simulator.model, device)
+        head = head_class(s.head).for_model(training_data.stepper.model, device)
         space, names, fixed = head.space, training_data.names, training_data.pairs.fixed
         weighs = s.weight_by_sensitivity
         dataset = ImitationDataset.of(policy, training_data, head, s.validation, weighs=weighs)

@@ -170,19 +170,19 @@ class Agent:
         """Whether it draws random numbers."""
         return self.head.noise_width > 0
 
-    def stepper(self, simulator: Stepper) -> Stepper:
+    def stepper(self, stepper: Stepper) -> Stepper:
         """Returns what takes the steps of the model that this agent drives.
 
         Args:
-            simulator: takes those of the job's driving model.
+            stepper: takes those of the job's driving model.
 
         Raises:
             ConfigError: the head needs a model around it, which this simulator does not have.
         """
-        model = self.head.driven_model(simulator.model)
-        if model is simulator.model:
-            return simulator
-        return simulator.for_model(model)
+        model = self.head.driven_model(stepper.model)
+        if model is stepper.model:
+            return stepper
+        return stepper.for_model(model)
 
     def base_of(self, parameters: Tensor) -> Tensor:
         """Returns the base of drivers with these calibrated parameters, `(D, n)`, SI units.

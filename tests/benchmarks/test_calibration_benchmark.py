@@ -73,7 +73,7 @@ def points_of(model: DrivingModel) -> Tensor:
 
 def by_hand(losses: SegmentLosses, name: str) -> Callable[[], Tensor]:
     """Returns the numba loop over the same segments and the same candidates, compiled."""
-    model = losses.simulator.model
+    model = losses.stepper.model
     limits = model.limits
     assert limits is not None
     assert limits.acceleration == numba_loops.FASTEST

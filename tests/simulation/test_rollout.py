@@ -99,11 +99,11 @@ def test_parameters_per_window(model: DrivingModel) -> None:
     leader, windows = wavy_leader(2, 24), 4
     p = candidates(model, 2, windows)
     out = simulate_follower(model, p, leader, start_of((2,)), DT, window=5)
-    simulator = MemoryStepper(model, DT, compile="never")
-    follower, speeds = simulator.begin(start_of((2,))), []
+    stepper = MemoryStepper(model, DT, compile="never")
+    follower, speeds = stepper.begin(start_of((2,))), []
     for k in range(23):  # the last window's parameters are kept for the rest
         at = Leader(*(x.T[k : k + 1] for x in leader[:3]), leader.length)
-        follower, _, speed = simulator.advance(
+        follower, _, speed = stepper.advance(
             follower, at, model.space.unpack(p[:, min(k // 5, windows - 1)])
         )
         speeds.append(speed)
@@ -293,11 +293,11 @@ class Remembers(Krauss):
 
 
 def test_memory_is_carried_through_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulator, leader = MemoryStepper(Remembers(), DT), wavy_leader(3, 8)
+    stepper, leader = MemoryStepper(Remembers(), DT), wavy_leader(3, 8)
     monkeypatch.setattr(rollout, "tile_size", lambda like: 4)
     in_time = Leader(*(x.T[:, :, None] for x in leader[:3]), leader.length[:, None])
     p = Krauss().space.unpack(candidates(Krauss(), 3, 5))
-    end, _, speed = simulator.advance(simulator.begin(start_of((3, 5))), in_time, p)
+    end, _, speed = stepper.advance(stepper.begin(start_of((3, 5))), in_time, p)
     torch.testing.assert_close(
         end.memory,
         torch.stack([torch.full((3, 5), 8.0, dtype=torch.float64), speed.sum(0)], dim=-1),

@@ -72,7 +72,7 @@ def calibration_tables(
         Further ones with a posterior, see `DriverPosteriors.tables`.
     """
     calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
-    elsewhere = not isinstance(context.simulator, MemoryStepper)
+    elsewhere = not isinstance(context.stepper, MemoryStepper)
     if not calibrated and settings.posterior != "none":
         log.warning(
             "calibration.posterior=%s has nothing to say: this job has calibrated no"
@@ -347,7 +347,7 @@ def find(context: ProtocolContext, parts: Parts, calibration: CalibrationSetting
     Raises:
         PluginError: it delivers no `ProtocolResult`.
     """
-    with closing(context.simulator), closing(parts.engine):
+    with closing(context.stepper), closing(parts.engine):
         result: object = parts.protocol.run(context)
         if not isinstance(result, ProtocolResult):
             raise PluginError(

@@ -233,7 +233,7 @@ class AcrossDrivers(Protocol):
             start = context.defaults(population).expand_as(population)
         base = None
         if s.base == "own":
-            space = context.simulator.model.adaptation_space
+            space = context.stepper.model.adaptation_space
             base = shrunk(space, fixed, s.shrinkage)
         return _Calibrated(fixed, population, start, base, labels)
 

@@ -118,7 +118,7 @@ def past_errors(
         if policy.base is not None and policy.context_rule.driver_specific:
             base = policy.base_of(early)[:, : early.shape[1]]
         each = torch.arange(len(rows), device=rows.device)
-        residual = policy.head.driven_model(context.simulator.model) is not context.simulator.model
+        residual = policy.head.driven_model(context.stepper.model) is not context.stepper.model
 
         def errors(agent: Agent, followers: Followers) -> Tensor:
             return _speed_errors(context.simulated(agent, followers, cut), batch, cut)

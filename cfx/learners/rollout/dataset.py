@@ -548,7 +548,7 @@ def _driver_features(
     if not policy.driver_features:
         return until.new_empty((len(batch), 0), dtype=torch.float32)
     since = torch.zeros_like(until)
-    dt = training_data.simulator.dt
+    dt = training_data.stepper.dt
     return measure(batch, policy.driver_features, dt, since, until).float()
 
 

@@ -107,16 +107,16 @@ class RolloutLearner(Learner):
         Raises:
             ConfigError: the simulator or the model has no gradients.
         """
-        simulator, s = training_data.simulator, self.settings
+        stepper, s = training_data.stepper, self.settings
         if policy.adapts:
-            self.require_gradients(simulator.model, simulator.differentiable)
+            self.require_gradients(stepper.model, stepper.differentiable)
         if not {"gap", "time_headway"} & set(policy.inputs):
             log.info(
                 "The policy does not see the gap; policy.inputs=situation gives smaller errors"
             )
         training_data = with_simulated_drivers(training_data, s.simulated_drivers)
         generator = torch.Generator().manual_seed(training_data.seed)
-        head = head_class(s.head).for_model(simulator.model)
+        head = head_class(s.head).for_model(stepper.model)
         dataset = RolloutDataset.of(training_data, policy, head, s, generator)
         network = untrained(policy, dataset, head, generator)
         start = None
@@ -225,7 +225,7 @@ def check_start(
     Raises:
         ConfigError: the policy, the model, the head, windows or the time step are others.
     """
-    model, windows = training_data.simulator.model, training_data.windows
+    model, windows = training_data.stepper.model, training_data.windows
     unlike: list[tuple[str, object]] = []
     if agent.policy.identity() != policy.identity():
         unlike.append(("policy", agent.policy_node))
@@ -236,7 +236,7 @@ def check_start(
         unlike.append(("learner.head", agent.head.name))
     if agent.windows != windows:
         unlike.append(("windows", agent.windows.model_dump()))
-    if abs(agent.dt - training_data.simulator.dt) > 1e-6:
+    if abs(agent.dt - training_data.stepper.dt) > 1e-6:
         unlike.append(("data.time_step", agent.dt))
     if unlike:
         key, value = unlike[0]

@@ -151,14 +151,14 @@ def _errors(
     Returns:
         The objective and the gap's RMSE, `(U, F, C, 2)`, in single precision.
     """
-    simulator, rows = training_data.simulator, dataset.recordings.pair
+    stepper, rows = training_data.stepper, dataset.recordings.pair
     recorded = training_data.pairs.index[rows]
     last = training_data.pairs.split.frame.to(rows.device)[rows]
     # What heads answer beyond the model's parameters stands behind them, and is left out.
-    space = simulator.model.adaptation_space
+    space = stepper.model.adaptation_space
     bases = bases[..., : len(space)]
     # Whether a kernel pays is asked for all parts together.
-    simulator = simulator.for_work(len(last) * len(frames) * steps * bases.shape[1])
+    stepper = stepper.for_work(len(last) * len(frames) * steps * bases.shape[1])
     size = max(1, _AT_ONCE // (len(frames) * steps))
     parts = []
     for some in range(0, len(last), size):
@@ -167,7 +167,7 @@ def _errors(
         pair = torch.arange(count, device=rows.device).repeat_interleave(len(frames))
         first = frames.repeat(count)
         losses = SegmentLosses.of_segments(
-            simulator,
+            stepper,
             training_data.objective,
             batch,
             pair,

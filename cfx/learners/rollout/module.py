@@ -90,8 +90,8 @@ class RolloutModule(BatchedModule):
         network.load_state_dict(shard.weights)
         super().__init__(network, training_data.names, settings, on_epoch, ensemble_size=size)
         self.shard, self.expert = shard, expert
-        windows, dt = training_data.windows, training_data.simulator.dt
-        model = head.driven_model(training_data.simulator.model)
+        windows, dt = training_data.windows, training_data.stepper.dt
+        model = head.driven_model(training_data.stepper.model)
         core = AgentCore(shard.policy, network, dataset.scaler, head)
         self.temperature = torch.tensor(settings.temperature, device=device)
         self.exact_step = WindowStep(core, model, windows, dt)

@@ -53,12 +53,12 @@ def checkpoint_path(
     description = {
         "learner": learner,
         "policy": policy.identity(),
-        "model": training_data.simulator.model.identity(),
+        "model": training_data.stepper.model.identity(),
         "objective": training_data.objective.identity(),
         "windows": training_data.windows.model_dump(),
         "code": folder_hash(base.__file__),
         "data": digest.hexdigest(),
-        "dt": training_data.simulator.dt,
+        "dt": training_data.stepper.dt,
         "names": training_data.names,
         "seed": training_data.seed,
     }
@@ -120,7 +120,7 @@ class TrainingShard:
     @property
     def head(self) -> ParameterHead:
         """Makes parameters of the networks' answers."""
-        model, device = self.training_data.simulator.model, self.dataset.pair.device
+        model, device = self.training_data.stepper.model, self.dataset.pair.device
         return head_class(self.settings.head).for_model(model, device)
 
 
@@ -252,15 +252,15 @@ def _without_pairs(training_data: TrainingData) -> TrainingData:
 
 def _expert(shard: TrainingShard, weights: dict[str, Tensor]) -> TrainingShard:
     """Returns the experts of a shard: the same trajectories, driven by `Direct`."""
-    s, simulator = shard.settings, MemoryStepper(Direct(), shard.training_data.simulator.dt)
+    s, stepper = shard.settings, MemoryStepper(Direct(), shard.training_data.stepper.dt)
     epochs = s.epochs - s.distillation_epochs
     changes = {"head": OffsetHead.name, "distillation_epochs": 0, "epochs": epochs}
-    space, fixed = simulator.model.adaptation_space, shard.training_data.pairs.fixed
+    space, fixed = stepper.model.adaptation_space, shard.training_data.pairs.fixed
     default = space.to_unit(space.defaults(dtype=fixed.dtype, device=fixed.device)).float()
     return replace(
         shard,
         settings=s.model_copy(update=changes),
-        training_data=replace(shard.training_data, simulator=simulator),
+        training_data=replace(shard.training_data, stepper=stepper),
         dataset=shard.dataset.for_base(default),
         weights=weights,
         checkpoint=None if shard.checkpoint is None else expert_checkpoint(shard.checkpoint),

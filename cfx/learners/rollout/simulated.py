@@ -42,7 +42,7 @@ def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingD
     if count == 0:
         return training_data
     frames = training_data.recorded.mask.shape[1]
-    drivers = simulated_drivers(count, training_data.simulator.dt, frames, training_data.seed)
+    drivers = simulated_drivers(count, training_data.stepper.dt, frames, training_data.seed)
     recorded, pairs = training_data.recorded, training_data.pairs
     batch = PairBatch.of(drivers, device=training_data.device, frames=frames)
     whole = Split.none(drivers, training_data.windows)

@@ -62,7 +62,7 @@ def training_data(
     if together:
         network, names = torch.zeros_like(network), ("all",)
     return TrainingData(
-        simulator=MemoryStepper(model, pairs.dt),
+        stepper=MemoryStepper(model, pairs.dt),
         recorded=PairBatch.of(pairs),
         pairs=TrainingPairs(
             index=torch.arange(PAIRS),
@@ -211,7 +211,7 @@ def networks_are_independent(learner: Learner) -> None:
     labels = data.pairs.labels
     if labels is not None:
         of_first = (labels.windows.pair == 0)[:, None]
-        default = data.simulator.model.space.defaults()
+        default = data.stepper.model.space.defaults()
         parameters = torch.where(of_first, default, labels.parameters)
         labels = replace(labels, parameters=parameters)
         other = replace(other, pairs=replace(other.pairs, labels=labels))
@@ -287,7 +287,7 @@ def _rmse(result: TrainingResult, data: TrainingData) -> float:
     """Returns the RMSE of speed in closed loop over the training parts, m/s."""
     first = torch.zeros(PAIRS, dtype=torch.int64)
     followers = Followers(data.batch, data.pairs.network)
-    loop = simulate_closed_loop(data.simulator, _agent(result, data), followers, first)
+    loop = simulate_closed_loop(data.stepper, _agent(result, data), followers, first)
     frames = torch.arange(loop.speed.shape[1])
     counted = (frames > 0) & (frames <= data.pairs.split.frame[:, None])
     error = (loop.speed - data.batch.follower_speed[:, : loop.speed.shape[1]])[counted]
@@ -296,7 +296,7 @@ def _rmse(result: TrainingResult, data: TrainingData) -> float:
 
 def _head(result: TrainingResult, data: TrainingData) -> ParameterHead:
     name = result.head or head_name(has_base=result.base is not None)
-    return head_class(name).for_model(data.simulator.model)
+    return head_class(name).for_model(data.stepper.model)
 
 
 def _agent(result: TrainingResult, data: TrainingData) -> Agent:
@@ -305,7 +305,7 @@ def _agent(result: TrainingResult, data: TrainingData) -> Agent:
         model_node={},
         policy_node={},
         windows=WINDOWS,
-        dt=data.simulator.dt,
+        dt=data.stepper.dt,
         names=data.names,
         base=result.base,
     )

@@ -42,7 +42,7 @@ def module(data: TrainingData, policy: Policy, **options: Any) -> RolloutModule:
     """Returns a module whose networks answer something."""
     settings = RolloutSettings(**(QUICK | options))
     generator = torch.Generator().manual_seed(0)
-    head = head_class(settings.head).for_model(data.simulator.model)
+    head = head_class(settings.head).for_model(data.stepper.model)
     dataset = RolloutDataset.of(data, policy, head, settings, generator)
     network = shard.untrained(policy, dataset, head, generator)
     return module_with(network, dataset, data, settings, policy)

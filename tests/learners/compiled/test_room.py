@@ -103,7 +103,7 @@ def a_module(model: Any = None, **options: Any) -> module.RolloutModule:
     data, policy = training_data(model=model, networks=1), gru()
     settings = RolloutSettings(**(QUICK | options))
     dataset = placed(data, policy)
-    head = head_class(settings.head).for_model(data.simulator.model)
+    head = head_class(settings.head).for_model(data.stepper.model)
     network = module.untrained(policy, dataset, head, torch.Generator().manual_seed(0))
     return module_with(network, dataset, data, settings, policy)
 

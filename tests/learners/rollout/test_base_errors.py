@@ -95,10 +95,10 @@ def test_a_kernel_finds_the_errors_that_pytorch_does(monkeypatch: pytest.MonkeyP
     data = training_data(networks=2, base=TRUE.repeat(2, 1))
     dataset = placed(data, gru(), 0.0)
     eager = BaseErrors.of(
-        replace(data, simulator=MemoryStepper(Krauss(), 0.1, compile="never")), dataset, 12
+        replace(data, stepper=MemoryStepper(Krauss(), 0.1, compile="never")), dataset, 12
     )
     kernel = BaseErrors.of(
-        replace(data, simulator=MemoryStepper(Krauss(), 0.1, compile="always")), dataset, 12
+        replace(data, stepper=MemoryStepper(Krauss(), 0.1, compile="always")), dataset, 12
     )
     torch.testing.assert_close(kernel.over_windows, eager.over_windows)
     torch.testing.assert_close(kernel.over_pair, eager.over_pair)
