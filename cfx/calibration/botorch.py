@@ -100,7 +100,7 @@ class BotorchSettings(Settings):
 
 
 class BotorchOptimizer(Optimizer):
-    """Gaussian-process optimisation of all problems of a chunk at once.
+    """Gaussian-process optimisation of all problems of a shard at once.
 
     One candidate of each problem is evaluated per iteration (q = 1). First, guesses and Sobol
     points are evaluated, `initial` in all. Then, `iterations` times, a Gaussian process is fitted
@@ -137,7 +137,7 @@ class BotorchOptimizer(Optimizer):
         "restarts": 2,
         "climb_steps": 3,
     }
-    in_parts = True
+    in_shards = True
 
     def evaluations(self) -> int:
         return self.space_filling() + self.settings.iterations
@@ -162,7 +162,7 @@ class BotorchOptimizer(Optimizer):
         settings = self.settings
         problems, g, n = guesses.shape
         check_room(settings.initial, g, key="initial")
-        points = sobol(self.space_filling() - g, n, seed=seed, like=guesses)
+        points = sobol(self.space_filling() - g, n, seed=seed, device=guesses.device)
         tried = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
         losses = objective(tried)
         search = _Search(settings, tried, losses, guesses=g, seed=seed)
@@ -175,7 +175,7 @@ class BotorchOptimizer(Optimizer):
 
 
 class _Search:
-    """The Gaussian processes of a chunk of problems: their evaluations and next candidates."""
+    """The Gaussian processes of a shard of problems: their evaluations and next candidates."""
 
     def __init__(
         self, settings: BotorchSettings, tried: Tensor, losses: Tensor, *, guesses: int, seed: int

@@ -108,7 +108,7 @@ class GradientSearch(RandomSearch):
         check_room(settings.first, g, key="samples")
         each_step = n + len(_LENGTHS)
         stages, rest = _stages(settings.searches, settings.samples - settings.first, each_step)
-        points = sobol(settings.first - g + rest, n, seed=seed, like=guesses)
+        points = sobol(settings.first - g + rest, n, seed=seed, device=guesses.device)
         shared = points.expand(problems, -1, -1)
         tried, losses = [guesses, shared], [objective(guesses)]
         losses.append(objective(shared))

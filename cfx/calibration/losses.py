@@ -74,7 +74,9 @@ class Prior:
 
     def cut(self, which: slice | Tensor) -> Prior:
         """Returns the prior of some of the problems."""
-        center = self.center if self.center.dim() == 1 else self.center[which]
+        center = self.center
+        if center.dim() > 1:
+            center = center[which]
         return replace(self, center=center, scale=self.scale[which])
 
     def penalty(self, candidates: Tensor) -> Tensor:
@@ -162,7 +164,7 @@ class SegmentLosses:
         """Memory that one candidate of one problem needs.
 
         Without trajectories: its parameters, in unit space and not, the sums and the loss. Else
-        positions, speeds, a term, its masked copy and the intermediate values of one block; a gap
+        positions, speeds, a term, its masked copy and the intermediate values of one step; a gap
         is another value with another term.
         """
         parameters = len(self.stepper.model.space.names)
@@ -172,8 +174,10 @@ class SegmentLosses:
             values = 6 * self.steps + 32
         else:
             values = 4 * self.steps + 32
-        of_prior = 0 if self.prior is None else self.prior.bytes_per_candidate
-        return values * self.segments.measured_speed.element_size() + of_prior
+        size = values * self.segments.measured_speed.element_size()
+        if self.prior is not None:
+            size += self.prior.bytes_per_candidate
+        return size
 
     @property
     def accumulates(self) -> bool:
@@ -194,8 +198,9 @@ class SegmentLosses:
     def take(self, problems: slice | Tensor) -> SegmentLosses:
         """Returns the problems of numbers `(S,)` int64; one may stand there more than once."""
         segments = Segments(*(values[..., problems] for values in self.segments))
-        prior = None if self.prior is None else self.prior.cut(problems)
-        return replace(self, segments=segments, prior=prior)
+        if self.prior is None:
+            return replace(self, segments=segments)
+        return replace(self, segments=segments, prior=self.prior.cut(problems))
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor | Mapping[str, Tensor]) -> Tensor:
@@ -231,16 +236,29 @@ class SegmentLosses:
             gap: compute the simulated gap; without, it is NaN.
         """
         s = self.segments
-        shape = common_shape([(self.problems, 1), *[value.shape for value in p.values()]])
-        start = [value[:, None].expand(shape) for value in (s.position, s.speed, s.acceleration)]
-        leader = (s.leader_position, s.leader_speed, s.leader_acceleration, s.leader_length)
-        follower = self.stepper.begin(Start(*start))
-        _, position, speed = self.stepper.advance(
-            follower, Leader(*(value[..., None] for value in leader)), p
+        shapes: list[tuple[int, ...]] = [(self.problems, 1)]
+        for value in p.values():
+            shapes.append(tuple(value.shape))
+        shape = common_shape(shapes)
+        start = Start(
+            s.position[:, None].expand(shape),
+            s.speed[:, None].expand(shape),
+            s.acceleration[:, None].expand(shape),
         )
+        # One leader for all candidates: (K, P, 1) broadcasts to (K, P, q) without a copy.
+        leader = Leader(
+            s.leader_position[..., None],
+            s.leader_speed[..., None],
+            s.leader_acceleration[..., None],
+            s.leader_length[..., None],
+        )
+        _, position, speed = self.stepper.advance(self.stepper.begin(start), leader, p)
+        simulated_gap = speed.new_tensor(torch.nan)
+        if gap:
+            simulated_gap = s.leader_rear[..., None] - position
         return FrameValues(
             speed=speed,
-            gap=s.leader_rear[..., None] - position if gap else speed.new_tensor(torch.nan),
+            gap=simulated_gap,
             measured_speed=s.measured_speed[..., None],
             measured_gap=s.measured_gap[..., None],
             dt=self.stepper.dt,
@@ -313,11 +331,11 @@ _SUMMED_AT_ONCE = 1 << 25
 again, and stays in the process's own memory (`cfx.core.memory`)."""
 
 _SEGMENTS_AT_ONCE = 1024
-"""Segments that are simulated for a block of candidates: memory does not grow with their number,
-and the block stays long."""
+"""Segments that are simulated for a shard of candidates: memory does not grow with their number,
+and the shard has many candidates."""
 
 _VECTOR = 32
-"""Blocks of candidates are multiples of this, the number that the kernel simulates together."""
+"""Shards of candidates are multiples of this, the number that the kernel simulates together."""
 
 
 @dataclass(frozen=True)
@@ -332,7 +350,7 @@ class PooledLosses:
     Attributes:
         segments: D segments.
         members: the segments of each of K problems, bool `(K, D)`.
-        memory: bound in bytes for what is simulated at once; candidates are simulated in blocks
+        memory: bound in bytes for what is simulated at once; candidates are simulated in shards
             where all segments of all of them need more.
         prior: added to the losses; None: none.
     """
@@ -354,9 +372,11 @@ class PooledLosses:
 
     @property
     def bytes_per_candidate(self) -> int:
-        """Memory of one candidate of one problem besides the blocks: the sum and the mean."""
-        of_prior = 0 if self.prior is None else self.prior.bytes_per_candidate
-        return 2 * torch.float64.itemsize + of_prior
+        """Memory of one candidate of one problem besides the shards: the sum and the mean."""
+        size = 2 * torch.float64.itemsize
+        if self.prior is not None:
+            size += self.prior.bytes_per_candidate
+        return size
 
     def for_work(self, candidates: int) -> PooledLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
@@ -366,45 +386,78 @@ class PooledLosses:
 
     def select(self, first: int, last: int) -> PooledLosses:
         """Returns problems `first` to `last - 1`."""
-        prior = None if self.prior is None else self.prior.cut(slice(first, last))
-        return replace(self, members=self.members[first:last], prior=prior)
+        members = self.members[first:last]
+        if self.prior is None:
+            return replace(self, members=members)
+        return replace(self, members=members, prior=self.prior.cut(slice(first, last)))
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
         """Returns losses `(K, q)`, in the objective's unit, of candidates `(K, q, n)`."""
         shared = bool((candidates == candidates[:1]).all())
         used = self.members.any(0).nonzero()[:, 0]
-        # The parts are small, but there are many: together they may be worth compiling for, which
-        # none of them is alone.
-        simulated = len(used) if shared else int(self.members.sum())
+        # Shards are small, but there are many: together they may be worth compiling for, which none
+        # of them is alone.
+        simulated = int(self.members.sum())
+        if shared:
+            simulated = len(used)
         work = self.segments.steps * simulated * candidates.shape[1]
         stepper = self.segments.stepper.for_work(work)
         segments = replace(self.segments, stepper=stepper)
         total = candidates.new_zeros(candidates.shape[:2])
-        for some in torch.split(used, _SEGMENTS_AT_ONCE):
-            members = self.members[:, some]
-            problem, place = members.nonzero().unbind(1)
+        for numbers in torch.split(used, _SEGMENTS_AT_ONCE):
             if shared:
-                own = segments.take(some)
-                for columns, block in self._blocks(own, len(some), total, candidates[:1]):
-                    found = own(block.expand(len(some), -1, -1)).to(total)
-                    columns.index_add_(0, problem, found[place])
-                continue
-            groups = _by_problems(members)
-            taken = [segments.take(some[group.places]) for group in groups]
-            for columns, block in self._blocks(taken[0], len(place), total, candidates):
-                width = block.shape[1]
-                found = columns.new_empty((len(place), width))
-                for own, group in zip(taken, groups, strict=True):
-                    losses = own(block[group.problems].flatten(1, 2))
-                    found[group.members] = losses.to(total).reshape(*group.problems.shape, width)
-                columns.index_add_(0, problem, found)
+                self._add_shared(segments, numbers, total, candidates[:1])
+            else:
+                self._add(segments, numbers, total, candidates)
         losses = total / self.members.sum(1, keepdim=True)
         if self.prior is None:
             return losses
         return losses + self.prior.penalty(candidates)
 
-    def _blocks(
+    def _add_shared(
+        self,
+        segments: SegmentLosses | FullTrajectories,
+        numbers: Tensor,
+        total: Tensor,
+        candidates: Tensor,
+    ) -> None:
+        """Adds the losses of segments for candidates `(1, q, n)` that all problems have.
+
+        Args:
+            segments: all of them.
+            numbers: of those whose losses are added.
+            total: sums of losses `(K, q)`, changed in place.
+            candidates: each is simulated once, whichever problems a segment belongs to.
+        """
+        problem, place = self.members[:, numbers].nonzero().unbind(1)
+        losses_of = segments.take(numbers)
+        for columns, shard in self._shards(losses_of, len(numbers), total, candidates):
+            losses = losses_of(shard.expand(len(numbers), -1, -1)).to(total)
+            columns.index_add_(0, problem, losses[place])
+
+    def _add(
+        self,
+        segments: SegmentLosses | FullTrajectories,
+        numbers: Tensor,
+        total: Tensor,
+        candidates: Tensor,
+    ) -> None:
+        """As `_add_shared`, for candidates `(K, q, n)` of each problem's own."""
+        members = self.members[:, numbers]
+        problem, place = members.nonzero().unbind(1)
+        groups = _by_problems(members)
+        losses_of = [segments.take(numbers[group.places]) for group in groups]
+        for columns, shard in self._shards(losses_of[0], len(place), total, candidates):
+            width = shard.shape[1]
+            losses = columns.new_empty((len(place), width))
+            for losses_of_group, group in zip(losses_of, groups, strict=True):
+                # (G, m, q, n) -> (G, m q, n): a segment is simulated once for all its problems.
+                of_group = losses_of_group(shard[group.problems].flatten(1, 2)).to(total)
+                losses[group.members] = of_group.reshape(*group.problems.shape, width)
+            columns.index_add_(0, problem, losses)
+
+    def _shards(
         self, segments: SegmentLosses, simulated: int, total: Tensor, candidates: Tensor
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Yields columns of `total` `(K, q)` with their candidates, of `(K, q, n)` or `(1, q, n)`.
@@ -414,11 +467,11 @@ class PooledLosses:
         bound = min(self.memory, _BYTES_AT_ONCE)
         if segments.accumulates:
             bound = min(self.memory, _SUMMED_AT_ONCE)
-        block = max(1, bound // (segments.bytes_per_candidate * simulated))
-        if block > _VECTOR:
-            block -= block % _VECTOR
-        columns = torch.split(total, block, dim=1)
-        yield from zip(columns, torch.split(candidates, block, dim=1), strict=True)
+        size = max(1, bound // (segments.bytes_per_candidate * simulated))
+        if size > _VECTOR:
+            size -= size % _VECTOR
+        columns = torch.split(total, size, dim=1)
+        yield from zip(columns, torch.split(candidates, size, dim=1), strict=True)
 
 
 class _Group(NamedTuple):

@@ -68,7 +68,7 @@ def segments(model: DrivingModel, problems: int, steps: int) -> SegmentLosses:
 
 def points_of(model: DrivingModel) -> Tensor:
     """Returns the candidates that random search tries besides the default set, `(q, n)`."""
-    return sobol(SAMPLES - 1, len(model.space.names), seed=0, like=torch.zeros(1).double())
+    return sobol(SAMPLES - 1, len(model.space.names), seed=0, device=torch.device("cpu"))
 
 
 def by_hand(losses: SegmentLosses, name: str) -> Callable[[], Tensor]:
