@@ -214,8 +214,8 @@ def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     """Returns `_stepper`, compiled for a number of steps; equal models share it."""
     key = (kernel.model_key(model), float(model.temperature), dt, steps)
     if key not in _COMPILED:
-        # Each model and number of steps has a cache of its own: torch counts recompilations per function, and
-        # gives up after eight.
+        # Each model and number of steps has a cache of its own: torch counts recompilations per
+        # function, and gives up after eight.
         take = _stepper(model, dt, steps)
         _COMPILED[key] = torch_compiled(take, dynamic=True, isolate_recompiles=True)
     return _COMPILED[key]
