@@ -291,8 +291,8 @@ def calibrate(
         from cfx.app.job import steps
         from cfx.simulation.windows import Split
 
-        _, parts, context = steps.without_files(experiment.config, recording.selected)
-        with closing(parts.engine):
+        _, components, context = steps.without_files(experiment.config, recording.selected)
+        with closing(components.engine):
             last = Split.of(context.pairs, context.windows, context.split).frame
             found = context.calibrator.fixed(context.pairs, context.batch, last)
     ids = pd.Index([pair.pair_id for pair in context.pairs], name="pair_id")

@@ -127,8 +127,8 @@ def forecast(
         recording = pairs_from(pairs)
         chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
         experiment = config(recording, **chosen)
-        _, parts, context = steps.without_files(experiment.config, recording.selected)
-        finished = cast(Any, parts.protocol).finished
+        _, components, context = steps.without_files(experiment.config, recording.selected)
+        finished = cast(Any, components.protocol).finished
         finished.check(context.pairs)
         agent: Agent = finished.agent.to(context.batch.lengths.device)
         if samples and not agent.is_stochastic:

@@ -30,8 +30,7 @@ _AT_ONCE = 1_000_000
 
 _LEAST_GAP = 1.0
 """m: added to the gap's error of the base, as the objective's floor is to the objective's:
-otherwise
-trajectories that the base follows well would outweigh all others."""
+otherwise trajectories that the base follows well would outweigh all others."""
 
 _LEAST_DIVISOR = 1e-6
 """Divisor at least, for an objective without a floor."""
@@ -73,13 +72,15 @@ class BaseErrors:
     def of(cls, training_data: TrainingData, dataset: RolloutDataset, horizon: int) -> BaseErrors:
         """Simulates the bases, in the precision of the training data; `horizon` in windows."""
         networks, drivers = dataset.pair.shape
-        own = dataset.base
+        base = dataset.base
         pooled = dataset.pooled[:, None].expand(-1, drivers, -1)
         if training_data.pairs.base is None:
-            pooled = own
-        pair = torch.cat([dataset.pair, dataset.pair], 1)[..., None].to(own.dtype)
-        wanted = torch.cat([pair, torch.cat([own, pooled], 1)], -1)
-        rows, row = torch.unique(wanted.flatten(0, 1), dim=0, return_inverse=True)
+            pooled = base
+        # Rows (pair, base) of all places, with each driver's base and with the pooled one: (N, 2 B,
+        # 1 + n). Those that are equal are simulated once.
+        pair = torch.cat([dataset.pair, dataset.pair], 1)[..., None].to(base.dtype)
+        pairs_and_bases = torch.cat([pair, torch.cat([base, pooled], 1)], -1)
+        rows, row = torch.unique(pairs_and_bases.flatten(0, 1), dim=0, return_inverse=True)
         row = row.view(networks, 2 * drivers)
         pair, unit = rows[:, 0].long(), rows[:, 1:]
         count = torch.bincount(pair, minlength=len(dataset.recordings.batch))
@@ -89,7 +90,7 @@ class BaseErrors:
         # A pair with fewer bases than another has one of them several times.
         bases = unit[first[:, None] + torch.minimum(number, count[:, None] - 1)]
         stride = training_data.windows.stride
-        frames = torch.arange(dataset.recordings.tokens.shape[1], device=own.device) * stride
+        frames = torch.arange(dataset.recordings.tokens.shape[1], device=base.device) * stride
         over_windows = _errors(training_data, dataset, bases, frames, horizon * stride)
         over_pair = _errors(training_data, dataset, bases, frames[:1], int(dataset.last.max()))
         return cls(
@@ -157,13 +158,14 @@ def _errors(
     # What heads answer beyond the model's parameters stands behind them, and is left out.
     space = stepper.model.adaptation_space
     bases = bases[..., : len(space)]
-    # Whether a kernel pays is asked for all parts together.
+    # Whether a kernel pays is asked for all shards together.
     stepper = stepper.for_work(len(last) * len(frames) * steps * bases.shape[1])
     size = max(1, _AT_ONCE // (len(frames) * steps))
-    parts = []
-    for some in range(0, len(last), size):
-        which = slice(some, some + size)
-        count, batch = len(last[which]), training_data.recorded[recorded[which]]
+    errors = []
+    for start in range(0, len(last), size):
+        shard = slice(start, start + size)
+        count, batch = len(last[shard]), training_data.recorded[recorded[shard]]
+        # Each pair from each of the frames on, (count F,).
         pair = torch.arange(count, device=rows.device).repeat_interleave(len(frames))
         first = frames.repeat(count)
         losses = SegmentLosses.of_segments(
@@ -172,14 +174,14 @@ def _errors(
             batch,
             pair,
             first.clamp(max=batch.mask.shape[1] - 1),
-            (last[which][pair] - first).clamp(0, steps),
+            (last[shard][pair] - first).clamp(0, steps),
         )
-        unit = bases[which].to(losses.segments.counted.dtype)
+        unit = bases[shard].to(losses.segments.counted.dtype)
         values = space.from_unit(unit).repeat_interleave(len(frames), 0)
         p = {name: value.contiguous() for name, value in space.unpack(values).items()}
-        errors = torch.stack([losses(p), replace(losses, objective=GapRmse())(p)], -1)
-        parts.append(errors.view(count, len(frames), -1, 2).float())
-    return torch.cat(parts)
+        of_shard = torch.stack([losses(p), replace(losses, objective=GapRmse())(p)], -1)
+        errors.append(of_shard.view(count, len(frames), -1, 2).float())
+    return torch.cat(errors)
 
 
 _EPSILON = 1e-4
