@@ -165,7 +165,7 @@ class BotorchOptimizer(Optimizer):
         points = sobol(self.space_filling() - g, n, seed=seed, device=guesses.device)
         tried = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
         losses = objective(tried)
-        search = _Search(settings, tried, losses, guesses=g, seed=seed)
+        search = _BatchSearch(settings, tried, losses, guesses=g, seed=seed)
         for _ in range(settings.iterations):
             candidate = search.ask()
             loss = objective(candidate)
@@ -174,7 +174,7 @@ class BotorchOptimizer(Optimizer):
         return tried, losses
 
 
-class _Search:
+class _BatchSearch:
     """The Gaussian processes of a shard of problems: their evaluations and next candidates."""
 
     def __init__(
@@ -386,12 +386,12 @@ class _Marginals(Model):
         # covariance filled up.
         with max_eager_kernel_size(0):
             found = self._process.posterior(X.squeeze(-2).transpose(0, 1))
-            return _Normal(
+            return _IndependentNormal(
                 found.mean.transpose(0, 1)[..., None], found.variance.transpose(0, 1)[..., None]
             )
 
 
-class _Normal(Posterior):
+class _IndependentNormal(Posterior):
     """Independent normal distributions: what an analytic acquisition function needs."""
 
     def __init__(self, mean: Tensor, variance: Tensor) -> None:

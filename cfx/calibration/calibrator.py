@@ -49,7 +49,7 @@ of them a job asks for."""
 
 
 @dataclass(frozen=True)
-class Labels:
+class WindowLabels:
     """The best parameters of each window.
 
     Attributes:
@@ -70,14 +70,14 @@ class Labels:
     sensitivity: Tensor
     diverged: Tensor
 
-    def select(self, pairs: Tensor) -> Labels:
+    def select(self, pairs: Tensor) -> WindowLabels:
         """Returns the labels of some pairs, `(D,)` int64, which are numbered anew.
 
         A pair may stand there more than once.
         """
         windows, places = self.windows.select(pairs.cpu())
         places = places.to(self.loss.device)
-        return Labels(
+        return WindowLabels(
             windows,
             self.parameters[places],
             self.loss[places],
@@ -225,7 +225,9 @@ class Calibrator:
         results = self._cached("Pooled parameters", keys, [1] * len(members), shard)
         return _stacked(results, requested_device)
 
-    def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
+    def labels(
+        self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor
+    ) -> WindowLabels:
         """Finds the parameters of each window; ties go to the driver-specific parameters.
 
         Not to the pooled ones: labels would depend on the fold and be calibrated once for each.
@@ -287,7 +289,7 @@ class Calibrator:
         for name in results[0]:
             values = np.concatenate([entry[name] for entry in results])
             joined[name] = torch.as_tensor(values).to(requested_device)
-        return Labels(windows=windows, **joined)
+        return WindowLabels(windows=windows, **joined)
 
     @torch.no_grad()
     def losses(

@@ -474,7 +474,7 @@ class PooledLosses:
         yield from zip(columns, torch.split(candidates, size, dim=1), strict=True)
 
 
-class _Group(NamedTuple):
+class _SegmentGroup(NamedTuple):
     """Segments that belong to equally many problems, m.
 
     Each is simulated once, for the candidates of all its problems: it is read once, and the kernel
@@ -491,7 +491,7 @@ class _Group(NamedTuple):
     members: Tensor
 
 
-def _by_problems(members: Tensor) -> list[_Group]:
+def _by_problems(members: Tensor) -> list[_SegmentGroup]:
     """Groups segments by the number of their problems, of memberships bool `(K, S)`."""
     number = members.flatten().cumsum(0).reshape(members.shape) - 1
     counts = members.sum(0)
@@ -499,5 +499,5 @@ def _by_problems(members: Tensor) -> list[_Group]:
     for count in sorted(set(counts.tolist())):
         places = (counts == count).nonzero()[:, 0]
         problems = members[:, places].T.nonzero()[:, 1].reshape(len(places), count)
-        groups.append(_Group(places, problems, number[problems, places[:, None]]))
+        groups.append(_SegmentGroup(places, problems, number[problems, places[:, None]]))
     return groups

@@ -16,7 +16,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.calibration.calibrator import Labels
+from cfx.calibration.calibrator import WindowLabels
 from cfx.calibration.objectives import Objective
 from cfx.calibration.rmse import SpeedRmse
 from cfx.core.component import Component
@@ -65,7 +65,7 @@ class TrainingPairs:
     network: Tensor
     fixed: Tensor
     base: Tensor | None = None
-    labels: Labels | None = None
+    labels: WindowLabels | None = None
     drivers: tuple[str, ...] | None = None
     sites: tuple[str, ...] | None = None
 

@@ -215,7 +215,10 @@ def fit(
         checkpoint: written after every epoch, so that interrupted training goes on there, and
             training that ended gives the same at once. None: no such file.
     """
-    is_gpu = device.type == "cuda"
+    accelerator = "gpu" if device.type == "cuda" else "cpu"
+    callbacks: list[pl.Callback] = []
+    if checkpoint is not None:
+        callbacks.append(EveryEpoch(checkpoint))
     module.begin_random_numbers(seed, device)
     with (
         dropout_from(module.network, module.generator),
@@ -230,10 +233,10 @@ def fit(
         warnings.filterwarnings("ignore", message=of_compiler)
         trainer = pl.Trainer(
             max_epochs=epochs,
-            accelerator="gpu" if is_gpu else "cpu",
+            accelerator=accelerator,
             devices=1,
             logger=False,
-            callbacks=[] if checkpoint is None else [EveryEpoch(checkpoint)],
+            callbacks=callbacks,
             # Jobs in a queue of Slurm are no parts of one training on many machines.
             plugins=[LightningEnvironment()],
             enable_checkpointing=False,

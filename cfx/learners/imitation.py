@@ -129,11 +129,14 @@ class ImitationLearner(Learner):
                 fit(module, s.epochs, training_data.seed, device, None)
             curves = module.curves()
             warn_of_nothing_learned(curves)
+        base = None
+        if head.needs_base:
+            base = space.from_unit(pooled.to(fixed.dtype))
         return TrainingResult(
             network=network.eval(),
             scaler=dataset.scaler,
             curves=curves,
-            base=space.from_unit(pooled.to(fixed.dtype)) if head.needs_base else None,
+            base=base,
             head=head.name,
             valid_range=learned_range(training_data),
         )

@@ -15,7 +15,6 @@ import copy
 import importlib.util
 import itertools
 import math
-import shutil
 import sysconfig
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -32,7 +31,7 @@ from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Simulator, SimulatorSettings, Stepper
 from cfx.simulation.kernel import run as kernel
-from cfx.simulation.kernel.compiler import torch_compiled
+from cfx.simulation.kernel.compiler import find_compiler, torch_compiled
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.trajectory import (
     ComponentKey,
@@ -160,7 +159,9 @@ class MemoryStepper(Stepper):
     def accumulate(
         self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, every: int | None = None
     ) -> tuple[Tensor, ...] | None:
-        candidates = max(math.prod(value.shape[1:]) for value in p.values())
+        candidates = 1
+        for value in p.values():
+            candidates = max(candidates, math.prod(value.shape[1:]))
         steps = segments.counted.numel() * candidates
         if segments.speed.device.type != "cpu" or not self._pays(steps, _WORTH_A_KERNEL):
             return None
@@ -233,7 +234,7 @@ def can_compile(device: torch.device) -> bool:
     # Debian's Python comes without: they are in python3-dev.
     if not Path(sysconfig.get_path("include"), "Python.h").is_file():
         return False
-    return any(shutil.which(name) for name in ("g++", "clang++", "c++"))
+    return find_compiler() is not None
 
 
 @same_environment()

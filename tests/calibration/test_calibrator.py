@@ -22,7 +22,7 @@ from cfx.calibration.optimizers import CandidateLosses, Optimizer
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.calibration.shards import CalibrationShard, Solver
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.core import threads
 from cfx.core.engine import Engine, Report
 from cfx.data.pairs import PairBatch, PairSet
@@ -268,7 +268,7 @@ def test_constant_drivers_of_the_synthetic_dataset_are_recovered() -> None:
     assert error["t_i"] < 0.15, error
 
 
-@pytest.mark.parametrize("objective", [GapRmse(), Mixed(), TheilU(), SpeedHuber()])
+@pytest.mark.parametrize("objective", [GapRmse(), Mixed(), TheilInequality(), SpeedHuber()])
 def test_every_objective_finds_what_determines_it(objective: Objective) -> None:
     pairs = wavy_pairs(Krauss(), TRUE)
     tool = calibrator(RandomSearch(samples=1024), objective=objective)
@@ -299,8 +299,8 @@ def test_a_calibration_reports_other_objectives_too() -> None:
 
 
 def test_ties_have_the_objectives_tolerance_unless_a_setting_says_another() -> None:
-    tool = calibrator(RandomSearch(samples=8), objective=TheilU())
-    assert tool.tie_tolerance(WindowSettings()) == TheilU.tie_tolerance
+    tool = calibrator(RandomSearch(samples=8), objective=TheilInequality())
+    assert tool.tie_tolerance(WindowSettings()) == TheilInequality.tie_tolerance
     assert tool.tie_tolerance(WindowSettings(tie_tolerance=0.0)) == 0.0
 
 

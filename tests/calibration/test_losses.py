@@ -9,7 +9,7 @@ from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
 from cfx.calibration.mixed import Mixed
 from cfx.calibration.objectives import FrameValues, Objective
 from cfx.calibration.rmse import GapRmse, SpeedRmse
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
 from cfx.models.krauss import Krauss
@@ -21,7 +21,7 @@ from tests.drives import wavy_pairs
 TRUE = torch.tensor([[1.2, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)
 
 
-OBJECTIVES = [SpeedRmse(), GapRmse(), Mixed(), TheilU(signal="gap")]
+OBJECTIVES = [SpeedRmse(), GapRmse(), Mixed(), TheilInequality(signal="gap")]
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES, ids=lambda one: type(one).__name__)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cfx.calibration.calibrator import Labels
+from cfx.calibration.calibrator import WindowLabels
 from cfx.data.pairs import PairBatch
 from cfx.errors import DataError
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
@@ -43,7 +43,7 @@ def training_data(
     speed = batch.leader_speed[windows.pair, windows.first]
     unit = torch.stack([speed / 20, 1 - speed / 20], dim=-1).clamp(0.05, 0.95)
     even = torch.full((len(windows),), sensitivity).double()
-    labels = Labels(
+    labels = WindowLabels(
         windows=windows,
         parameters=model.space.from_unit(unit),
         loss=even,

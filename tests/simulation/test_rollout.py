@@ -360,7 +360,7 @@ def test_without_pythons_headers_nothing_is_compiled(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Debian's Python has none unless python3-dev is installed."""
-    monkeypatch.setattr(rollout.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(rollout, "find_compiler", lambda: "/usr/bin/g++")
     monkeypatch.setattr(rollout.sysconfig, "get_path", lambda name: str(tmp_path))
     assert not can_compile(torch.device("cpu"))
     (tmp_path / "Python.h").touch()
@@ -368,7 +368,7 @@ def test_without_pythons_headers_nothing_is_compiled(
 
 
 def test_without_a_compiler_it_runs_eagerly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollout.shutil, "which", lambda name: None)
+    monkeypatch.setattr(rollout, "find_compiler", lambda: None)
     assert not can_compile(torch.device("cpu"))
     out = simulate_follower(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="always")
     assert_same(

@@ -14,7 +14,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.calibration.calibrator import Calibrator, Labels
+from cfx.calibration.calibrator import Calibrator, WindowLabels
 from cfx.calibration.objectives import Objective
 from cfx.core import registry
 from cfx.core.component import Component
@@ -111,7 +111,7 @@ class ProtocolContext:
         """`TrainedOn.quantiles` of all agents here."""
         return recorded_quantiles(self.batch)
 
-    def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
+    def labels(self, counts: Tensor, fixed: Tensor) -> WindowLabels | None:
         """Calibrates parameters per window (labels), if the learner needs any.
 
         Args:
@@ -307,7 +307,7 @@ class ProtocolResult:
     evaluation: Evaluation
     policy: Agent
     curves: pd.DataFrame
-    labels: Labels | None
+    labels: WindowLabels | None
     notes: Mapping[str, Any] = field(default_factory=dict)
     calibration: Mapping[str, float] = field(default_factory=dict)
 

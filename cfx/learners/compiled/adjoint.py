@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 
 from cfx.simulation.kernel.columns import Unsupported, literal
-from cfx.simulation.kernel.graph import Statement, power
+from cfx.simulation.kernel.graph import Assignment, power
 
 _RULES: dict[str, tuple[str, ...]] = {
     "add": ("{g}", "{g}"),
@@ -69,7 +69,7 @@ at its bounds, equal operands of `minimum` and `maximum` share it.
 
 
 def adjoint(
-    statements: Sequence[Statement],
+    statements: Sequence[Assignment],
     inputs: Collection[str],
     gradients: Mapping[str, Sequence[str]],
 ) -> tuple[list[str], dict[str, str]]:
@@ -108,7 +108,7 @@ def adjoint(
     return declarations, derivatives
 
 
-def _rules(statement: Statement) -> tuple[str, ...]:
+def _rules(statement: Assignment) -> tuple[str, ...]:
     """Returns what a statement adds to the derivative by each operand, as `_RULES` has it."""
     operation, _, exponent = statement.operation.partition(" ")
     if exponent:

@@ -162,10 +162,7 @@ def _source(program: Program, differentiated: Collection[int], block: int) -> st
     """
     inputs = _columns(program.inputs)
     outputs = _columns(program.outputs)
-    statements = []
-    for statement in program.statements:
-        kind = "bool" if statement.is_condition else "real"
-        statements.append(f"const {kind} {statement.name} = {statement.expression};")
+    statements = [statement.declaration for statement in program.statements]
 
     count = len(program.inputs)
     results, stored = [], []

@@ -28,7 +28,7 @@ differ by a thousandth."""
 _NONE, _ALL = slice(0, 0), slice(None)
 
 
-class CompiledLoop:
+class RecurrentLoop:
     """A window step of recurrent networks, compiled, repeated along trajectories.
 
     Args:
@@ -77,7 +77,7 @@ class CompiledLoop:
             with torch.no_grad():
                 simulated.run()
             state = simulated.after
-        length = path.cut_after or windows
+        length = path.windows_of_segment(windows)
         weights = tuple(network.parameters())
         for first in range(0, windows, length):
             driven = slice(first, min(first + length, windows))
@@ -128,7 +128,7 @@ class _Differentiable(torch.autograd.Function):
 
 def compile_windows(
     training: WindowStep, temperature: Tensor | None, validation: WindowStep
-) -> dict[WindowStep, CompiledLoop]:
+) -> dict[WindowStep, RecurrentLoop]:
     """Compiles the windows of a training, on all cores.
 
     Args:
@@ -145,8 +145,8 @@ def compile_windows(
             is no C++ compiler.
     """
     loops = {
-        training: CompiledLoop(training, temperature, trains=True),
-        validation: CompiledLoop(validation, None, trains=False),
+        training: RecurrentLoop(training, temperature, trains=True),
+        validation: RecurrentLoop(validation, None, trains=False),
     }
     codes = {}
     for loop in loops.values():

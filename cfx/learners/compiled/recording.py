@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from cfx.simulation.kernel.columns import Unsupported, operation_of
-from cfx.simulation.kernel.graph import Recording, Statement, traced
+from cfx.simulation.kernel.graph import Assignment, Recording, traced
 
 
 class Program(NamedTuple):
@@ -23,7 +23,7 @@ class Program(NamedTuple):
     """
 
     inputs: tuple[tuple[str, ...], ...]
-    statements: tuple[Statement, ...]
+    statements: tuple[Assignment, ...]
     outputs: tuple[tuple[str, ...], ...]
 
 

@@ -9,7 +9,7 @@ features, c = n + k features of conditioning.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -80,6 +80,14 @@ class RolloutBatch(NamedTuple):
                 changed[name] = change(table)
         return self._replace(**changed)
 
+    def repeated(self, times: int) -> RolloutBatch:
+        """Returns all trajectories so many times, each time behind the one before."""
+
+        def of_all(values: Tensor) -> Tensor:
+            return values.repeat(1, times)
+
+        return self.each(of_all)
+
     def without_unweighted(self) -> RolloutBatch:
         """Returns the trajectories that have weight, in order.
 
@@ -144,7 +152,13 @@ class Recordings:
 
     def __getitem__(self, rows: Tensor) -> Recordings:
         """Returns some of the pairs."""
-        return Recordings(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Recordings(
+            self.batch[rows],
+            self.pair[rows],
+            self.tokens[rows],
+            self.driver_features[rows],
+            self.time_gap[rows],
+        )
 
 
 @dataclass

@@ -177,12 +177,15 @@ class RolloutLearner(Learner):
         in_order = [trained[number] for number in range(count)]
         weights = {}
         for name in network.state_dict():
-            weights[name] = torch.cat([found.weights[name] for found in in_order])
+            weights[name] = torch.cat([shard.weights[name] for shard in in_order])
         network.load_state_dict(weights)
-        curves = pd.concat([found.curves for found in in_order], ignore_index=True)
+        curves = pd.concat([shard.curves for shard in in_order], ignore_index=True)
         curves = curves.sort_values("epoch", kind="stable", ignore_index=True)
         warn_of_nothing_learned(curves)
-        factors = [found.dispersion for found in in_order if found.dispersion is not None]
+        factors = []
+        for shard in in_order:
+            if shard.dispersion is not None:
+                factors.append(shard.dispersion)
         dispersion = None
         if factors:
             # The geometric mean of an ensemble's members.
@@ -205,7 +208,9 @@ def start_policy(start: str) -> Agent:
         DataError: there is no such policy, or none with such a network.
     """
     place, _, name = start.partition("#")
-    folder = folder_of_ready_made(place) if is_ready_made(place) else Path(place).expanduser()
+    folder = Path(place).expanduser()
+    if is_ready_made(place):
+        folder = folder_of_ready_made(place)
     try:
         agent = saved.load_agent(folder / "policy")
         if not name:
@@ -270,7 +275,11 @@ def begun(
     weights: dict[str, Tensor] = {}
     for name, value in agent.network.state_dict().items():
         repeated = value.repeat(len(dataset.pair) // size, *[1] * (value.dim() - 1))
-        weights[name.removeprefix("members.") if size > 1 else name] = repeated
+        key = name
+        if size > 1:
+            # Trained one by one, networks are not yet the members of an ensemble.
+            key = name.removeprefix("members.")
+        weights[key] = repeated
     network.load_state_dict(weights)
     mean, scale = agent.scaler.mean, agent.scaler.scale
     networks = len(dataset.pair)

@@ -199,13 +199,16 @@ class RolloutModule(BatchedModule):
             noise = self._noise(batch, windows, sampled)
             of_centre = torch.zeros_like(noise[:, :, : noise.shape[2] // sampled])
             noise = torch.cat([of_centre, noise], 2)
+        burn_in_windows = None
+        if path is not None:
+            burn_in_windows = self.burn_in_windows
         segments = simulate(
             step,
             self.dataset,
             batch,
             windows,
             path,
-            burn_in_windows=None if path is None else self.burn_in_windows,
+            burn_in_windows=burn_in_windows,
             expert=expert,
             noise=noise,
             compiled=self.compiled.get(step),
@@ -282,8 +285,8 @@ class RolloutModule(BatchedModule):
             greatest = torch.where(too_wide, middle, greatest)
             least = torch.where(too_wide, least, middle)
         self.dispersion.fill_(1.0)
-        known = (batch.weight > 0).any(1)
-        return torch.where(known, (0.5 * (least + greatest)).exp(), 1.0)
+        keeps_drivers = (batch.weight > 0).any(1)
+        return torch.where(keeps_drivers, (0.5 * (least + greatest)).exp(), 1.0)
 
     def _coverage(self, batch: RolloutBatch) -> Tensor:
         """Returns the share of speeds within the range of sampled paths, `(N,)`.
@@ -390,7 +393,9 @@ class RolloutModule(BatchedModule):
         """Compiles the windows of training and of validation."""
         s = self.settings
         if s.compile != "torch" and self.dataset.base.device.type == "cpu":
-            temperature = self.temperature if s.temperature > 0 else None
+            temperature = None
+            if s.temperature > 0:
+                temperature = self.temperature
             self.compiled = _compiled_loops(self.training_window, temperature, self.exact_step)
         # Sampled paths and experts go window by window.
         goes_by_windows = self.is_stochastic or s.distillation_epochs > 0

@@ -170,16 +170,16 @@ def augmentation(
     """
 
     def augment(history: History, pairs: Tensor) -> History:
-        like = history.gap
-        normal = torch.randn(like.shape, generator=generator).to(like)
-        draws = torch.rand((2, *like.shape), generator=generator).to(like)
+        gap = history.gap
+        normal = torch.randn(gap.shape, generator=generator).to(gap)
+        draws = torch.rand((2, *gap.shape), generator=generator).to(gap)
         scale = torch.exp(settings.scaling * normal)
         shift = torch.where(draws[0] < SHIFTED, settings.speed_shift * draws[1], 0.0)
         scaled = History(*(signal * scale for signal in history))
         return scaled._replace(
             leader_speed=scaled.leader_speed + shift,
             follower_speed=scaled.follower_speed + shift,
-            gap=scaled.gap + shift * time_gap[pairs][:, None].to(like),
+            gap=scaled.gap + shift * time_gap[pairs][:, None].to(gap),
         )
 
     return augment

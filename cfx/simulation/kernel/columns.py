@@ -37,21 +37,26 @@ def memory_names(width: int) -> tuple[str, ...]:
 
 def literal(value: float | bool) -> str:
     """Returns a number as C++ writes it, exactly."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
+    if value is True:
+        return "true"
+    if value is False:
+        return "false"
     number = float(value)
     if math.isnan(number):
         return "real(NAN)"
-    if math.isinf(number):
-        return "real(INFINITY)" if number > 0 else "real(-INFINITY)"
+    if number == math.inf:
+        return "real(INFINITY)"
+    if number == -math.inf:
+        return "real(-INFINITY)"
+    # Hexadecimal: decimal digits would be rounded.
     return f"real({number.hex()})"
 
 
 def array(shape: tuple[int, ...], expressions: Sequence[str]) -> Expressions:
     """Returns expressions in a shape."""
-    found = np.empty(len(expressions), dtype=object)
-    found[:] = expressions
-    return found.reshape(shape)
+    flat = np.empty(len(expressions), dtype=object)
+    flat[:] = expressions
+    return flat.reshape(shape)
 
 
 def shape_of(value: Tensor) -> tuple[int, ...]:
@@ -62,7 +67,10 @@ def shape_of(value: Tensor) -> tuple[int, ...]:
     """
     if list(value.shape).count(VEHICLES) > 1:
         raise Unsupported("an operation that is not elementwise")
-    return tuple(1 if size == VEHICLES else size for size in value.shape)
+    sizes = list(value.shape)
+    if VEHICLES in sizes:
+        sizes[sizes.index(VEHICLES)] = 1
+    return tuple(sizes)
 
 
 def broadcast(expressions: Expressions, shape: tuple[int, ...]) -> Expressions:
@@ -104,22 +112,23 @@ def _columns(node: fx.Node, source: Any) -> int:
 
 
 def _stack(node: fx.Node, known: Known) -> Expressions:
-    parts: Any = node.args[0]
-    return np.stack([known[one] for one in parts], int(_given(node, 1, "dim", 0)))
+    nodes: Any = node.args[0]
+    return np.stack([known[stacked] for stacked in nodes], int(_given(node, 1, "dim", 0)))
 
 
 def _arange(node: fx.Node, _known: Known) -> Expressions:
     numbers: Any = node.args
-    if not all(isinstance(one, int) for one in numbers):
-        raise Unsupported("columns that are not counted by whole numbers")
-    found = list(map(literal, range(*numbers)))
-    return array((len(found),), found)
+    for number in numbers:
+        if not isinstance(number, int):
+            raise Unsupported("columns that are not counted by whole numbers")
+    literals = [literal(number) for number in range(*numbers)]
+    return array((len(literals),), literals)
 
 
 def _cat(node: fx.Node, known: Known) -> Expressions:
-    parts: Any = node.args[0]
-    dimension = _columns(node, parts[0])
-    return np.concatenate([known[one] for one in parts], dimension)
+    nodes: Any = node.args[0]
+    dimension = _columns(node, nodes[0])
+    return np.concatenate([known[joined] for joined in nodes], dimension)
 
 
 def _select(node: fx.Node, known: Known) -> Expressions:
@@ -198,8 +207,8 @@ def _gather(node: fx.Node, known: Known) -> Expressions:
     last = len(names) - 1
     if names != list(memory_names(first + last + 1)[first:]):
         raise Unsupported("a look-up in columns that are not neighbours")
-    found = [f"(RECALLED({first}, {last}, {one}))" for one in known[index].flat]
-    return array(known[index].shape, found)
+    columns = [f"(RECALLED({first}, {last}, {number}))" for number in known[index].flat]
+    return array(known[index].shape, columns)
 
 
 MOVES: dict[str, Callable[[fx.Node, Known], Any]] = {

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cfx.calibration.calibrator import Labels
+from cfx.calibration.calibrator import WindowLabels
 from cfx.core.contract import expect_close, once
 from cfx.data.pairs import SIGNALS, PairBatch, PairSet
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
@@ -83,11 +83,11 @@ def _truth(pairs: PairSet, model: Krauss) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def _labels(split: Split, truth: Tensor) -> Labels:
+def _labels(split: Split, truth: Tensor) -> WindowLabels:
     """Returns the drivers' parameters as labels of all windows."""
     windows = Windows.of(split.windows, WINDOWS)
     count = len(windows)
-    return Labels(
+    return WindowLabels(
         windows=windows,
         parameters=truth[windows.pair],
         loss=torch.zeros(count, dtype=torch.float64),

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from cfx.calibration.rmse import GapRmse
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.learners.rollout import loss
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.loss import BaseErrors
@@ -53,7 +53,7 @@ def test_divisors_grow_with_the_scale_of_a_trajectory_where_the_objective_has_a_
     one, two = errors.over_horizon(batch), errors.over_horizon(scaled)
     torch.testing.assert_close(two.objective - 0.2, 2.0 * (one.objective - 0.2))
     torch.testing.assert_close(two.gap - 1.0, 2.0 * (one.gap - 1.0))
-    theil = BaseErrors.of(replace(data, objective=TheilU()), dataset, 12)
+    theil = BaseErrors.of(replace(data, objective=TheilInequality()), dataset, 12)
     assert torch.equal(theil.over_horizon(batch).objective, theil.over_horizon(scaled).objective)
 
 

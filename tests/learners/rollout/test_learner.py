@@ -14,7 +14,7 @@ from cfx.calibration.huber import SpeedHuber
 from cfx.calibration.mixed import Mixed
 from cfx.calibration.objectives import Objective
 from cfx.calibration.rmse import GapRmse, SpeedRmse
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.data.pairs import PairBatch
 from cfx.errors import ConfigError
 from cfx.learners.base import TrainingPairs, TrainingResult
@@ -94,7 +94,7 @@ _losses_of_objectives: list[list[float]] = []
 
 @pytest.mark.parametrize(
     "objective",
-    [SpeedRmse(), GapRmse(), Mixed(), TheilU(), SpeedHuber()],
+    [SpeedRmse(), GapRmse(), Mixed(), TheilInequality(), SpeedHuber()],
     ids=lambda o: type(o).__name__,
 )
 def test_it_minimises_the_objective_of_the_job(objective: Objective) -> None:
