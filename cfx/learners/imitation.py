@@ -126,7 +126,7 @@ class ImitationLearner(Learner):
             if self._is_worth_compiling(dataset.windows, device):
                 module.compile_step()
             with task:
-                fit(module, s.epochs, training_data.seed, device, None)
+                fit(module, training_data.seed, device, None)
             curves = module.curves()
             warn_of_nothing_learned(curves)
         base = None

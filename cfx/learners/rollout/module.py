@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -438,27 +439,27 @@ def train(shard: TrainingShard, report: Report) -> TrainedShard:
         report: called with how many epochs are done, in the end all that were planned.
     """
     if shard.checkpoint is not None and not _has_place(shard.checkpoint):
-        expert = shard.expert and replace(shard.expert, checkpoint=None)
-        shard = replace(shard, checkpoint=None, expert=expert)
-    module = _trained(shard, report)
+        expert_shard = shard.expert and replace(shard.expert, checkpoint=None)
+        shard = replace(shard, checkpoint=None, expert=expert_shard)
+    expert = None
+    if shard.expert is not None:
+        expert = _trained_expert(shard.expert, report)
+    module = RolloutModule(shard, expert, partial(report, 1))
+    fit(module, shard.training_data.seed, shard.dataset.pair.device, shard.checkpoint)
+    report(shard.settings.epochs - len(module.rows))
     return TrainedShard(module.network.state_dict(), module.curves(), module.fit_dispersion())
 
 
-def _trained(shard: TrainingShard, report: Report) -> RolloutModule:
-    """Returns trained networks; their experts are trained before."""
-    expert = None
-    if shard.expert is not None:
-        taught = _trained(shard.expert, report)
-        taught.network.requires_grad_(False)
-        if taught.compiled:
-            # Experts say one window at a time what they would do.
-            taught.training_window.compile()
-        expert = Expert(taught.training_window, taught.dataset)
-    module = RolloutModule(shard, expert, lambda: report(1))
-    seed, device = shard.training_data.seed, shard.dataset.pair.device
-    fit(module, shard.settings.epochs, seed, device, shard.checkpoint)
+def _trained_expert(shard: TrainingShard, report: Report) -> Expert:
+    """Trains the experts of a shard, on the same trajectories."""
+    module = RolloutModule(shard, None, partial(report, 1))
+    fit(module, shard.training_data.seed, shard.dataset.pair.device, shard.checkpoint)
     report(shard.settings.epochs - len(module.rows))
-    return module
+    module.network.requires_grad_(False)
+    if module.compiled:
+        # Experts say one window at a time what they would do.
+        module.training_window.compile()
+    return Expert(module.training_window, module.dataset)
 
 
 def _has_place(checkpoint: Path) -> bool:
