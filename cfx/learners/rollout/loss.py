@@ -57,15 +57,15 @@ class BaseErrors:
     Attributes:
         over_windows: over the horizon from each window on, `(R, W, 2)`.
         over_pair: over the whole training part, `(R, 2)`; of pooled bases alone.
-        own: the row of each place's driver with their base, `(N, B)`.
-        pooled: with the base of drivers without one of their own.
+        driver_row: of each place's driver with their base, `(N, B)`.
+        pooled_row: with the base of drivers without one of their own.
         objective: the job's.
     """
 
     over_windows: Tensor
     over_pair: Tensor
-    own: Tensor
-    pooled: Tensor
+    driver_row: Tensor
+    pooled_row: Tensor
     objective: Objective
 
     @classmethod
@@ -103,26 +103,27 @@ class BaseErrors:
 
     def only(self, networks: slice) -> BaseErrors:
         """Returns the errors of some networks."""
-        used = torch.cat([self.own[networks], self.pooled[networks]], 1)
+        used = torch.cat([self.driver_row[networks], self.pooled_row[networks]], 1)
         rows, row = torch.unique(used, return_inverse=True)
-        drivers = self.own.shape[1]
+        drivers = self.driver_row.shape[1]
         return replace(
             self,
             over_windows=self.over_windows[rows],
             over_pair=self.over_pair[rows],
-            own=row[:, :drivers],
-            pooled=row[:, drivers:],
+            driver_row=row[:, :drivers],
+            pooled_row=row[:, drivers:],
         )
 
     def over_horizon(self, batch: RolloutBatch) -> Divisors:
         """Returns the divisors over the horizon from where each trajectory begins."""
-        own, pooled = self.own[batch.row, batch.place], self.pooled[batch.row, batch.place]
-        row = torch.where(batch.cold_start, pooled, own)
+        driver_row = self.driver_row[batch.row, batch.place]
+        pooled_row = self.pooled_row[batch.row, batch.place]
+        row = torch.where(batch.cold_start, pooled_row, driver_row)
         return self._divisors(self.over_windows[row, batch.start], batch)
 
     def over_full_trajectory(self, batch: RolloutBatch) -> Divisors:
         """Returns the divisors over each trajectory from the first frame to the last."""
-        return self._divisors(self.over_pair[self.pooled[batch.row, batch.place]], batch)
+        return self._divisors(self.over_pair[self.pooled_row[batch.row, batch.place]], batch)
 
     def _divisors(self, errors: Tensor, batch: RolloutBatch) -> Divisors:
         """Takes the errors `(N, D, 2)` of unscaled trajectories."""

@@ -21,15 +21,15 @@ def test_errors_of_the_base_are_those_of_constant_parameters() -> None:
     data = training_data(networks=1, base=TRUE)
     errors = BaseErrors.of(data, placed(data, gru(), 0.0), 12)
     # The true parameters drive as the drivers did.
-    with_history = errors.over_windows[errors.own]
+    with_history = errors.over_windows[errors.driver_row]
     assert float(with_history[..., :30, 0].max()) < 1e-3
     result = untrained(replace(data, pairs=replace(data.pairs, base=None)), gru())
     found = loop(result, data, gru())
     squares = (found.speed - data.batch.follower_speed).square()[:, 1:]
     near = {"rtol": 1e-3, "atol": 1e-3}
-    full = errors.over_pair[errors.pooled][0, :, 0].double()
+    full = errors.over_pair[errors.pooled_row][0, :, 0].double()
     torch.testing.assert_close(full, squares.mean(1).sqrt(), **near)
-    horizon = errors.over_windows[errors.pooled][0, :, 0, 0].double()
+    horizon = errors.over_windows[errors.pooled_row][0, :, 0, 0].double()
     torch.testing.assert_close(horizon, squares[:, :60].mean(1).sqrt(), **near)
 
 
@@ -63,7 +63,7 @@ def test_networks_that_share_pairs_and_bases_share_their_errors() -> None:
     assert len(dataset.recordings.batch) == 6
     errors = BaseErrors.of(data, dataset, 12)
     assert len(errors.over_windows) == 12
-    assert torch.equal(errors.own[0], errors.own[2])
+    assert torch.equal(errors.driver_row[0], errors.driver_row[2])
     one = data.pairs.split.frame[:6].clone()
     one[0] = 120  # one network's training part of a pair ends earlier
     split = replace(data.pairs.split, frame=torch.cat([one, data.pairs.split.frame[6:]]))
