@@ -35,6 +35,8 @@ from tests.checkout import ROOT
 
 ROOMS = ("evaluation", "calibration", "learners", "policies", "simulation", "models")
 FOLDER = ROOT / ".cache" / "mutants"
+TREE = FOLDER / "tree"
+"""The copy of the checkout, whose files are changed and tested."""
 LEAST_TIMEOUT_S = 60.0
 SLOWER = 3.0
 """A mutant that takes so many times as long as the tests without a change is killed."""
@@ -76,7 +78,7 @@ def places(module: Path) -> Iterator[tuple[int, Mutant]]:
     plugins = importlib.import_module("cosmic_ray.plugins")
     trees = importlib.import_module("cosmic_ray.ast")
     tree = trees.get_ast(module.read_text(encoding="utf-8"))
-    name = module.relative_to(ROOT).as_posix()
+    name = module.relative_to(TREE).as_posix()
     nodes = list(_in_order(tree))
     for operator in plugins.operator_names():
         if plugins.get_operator(operator).arguments():
@@ -100,7 +102,7 @@ def mutated(mutant: Mutant) -> str | None:
     """Returns the changed file; None where annotations alone are changed, or nothing."""
     mutating = importlib.import_module("cosmic_ray.mutating")
     plugins = importlib.import_module("cosmic_ray.plugins")
-    before = (ROOT / mutant.module).read_text(encoding="utf-8")
+    before = (TREE / mutant.module).read_text(encoding="utf-8")
     changes = plugins.get_operator(mutant.operator)()
     after: str | None = mutating.mutate_code(before, changes, mutant.occurrence)
     if after is None or _without_annotations(after) == _without_annotations(before):
@@ -126,7 +128,7 @@ def drawn(rooms: Sequence[str], count: int, seed: int) -> Iterator[Mutant]:
     """Yields so many mutants, drawn among all places of the rooms."""
     by_place: dict[tuple[str, int], list[Mutant]] = {}
     for room in rooms:
-        for module in sorted((ROOT / "cfx" / room).rglob("*.py")):
+        for module in sorted((TREE / "cfx" / room).rglob("*.py")):
             for place, mutant in places(module):
                 by_place.setdefault((mutant.module, place), []).append(mutant)
     generator = random.Random(seed)  # noqa: S311 - no secret
@@ -140,26 +142,24 @@ def drawn(rooms: Sequence[str], count: int, seed: int) -> Iterator[Mutant]:
             yield mutant
 
 
-def copied() -> Path:
-    """Copies the checkout's files, those that git does not ignore, and returns the folder."""
-    tree = FOLDER / "tree"
-    shutil.rmtree(tree, ignore_errors=True)
+def copy_checkout() -> None:
+    """Copies the files of the checkout that git does not ignore."""
+    shutil.rmtree(TREE, ignore_errors=True)
     command = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "-z"]
     listed = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     for name in listed.stdout.split("\0"):
         source = ROOT / name
         if name and source.is_file():
-            target = tree / name
+            target = TREE / name
             target.parent.mkdir(parents=True, exist_ok=True)
             shutil.copyfile(source, target)
-    return tree
 
 
-def fails(tree: Path, room: str, timeout_s: float | None) -> bool | None:
+def fails(room: str, timeout_s: float | None) -> bool | None:
     """Runs the tests of a room; says whether they fail, None where they take too long."""
     environment = {
         **os.environ,
-        "PYTHONPATH": str(tree),
+        "PYTHONPATH": str(TREE),
         "PYTHONDONTWRITEBYTECODE": "1",
         "CFX_KERNEL_CACHE": str(FOLDER / "kernels"),
     }
@@ -168,7 +168,7 @@ def fails(tree: Path, room: str, timeout_s: float | None) -> bool | None:
     try:
         done = subprocess.run(
             command,
-            cwd=tree,
+            cwd=TREE,
             env=environment,
             capture_output=True,
             check=False,
@@ -179,28 +179,28 @@ def fails(tree: Path, room: str, timeout_s: float | None) -> bool | None:
     return done.returncode != 0
 
 
-def seconds_without_change(tree: Path, room: str) -> float:
+def seconds_without_change(room: str) -> float:
     """Returns how long a room's tests take, the second time, when code is compiled.
 
     Raises:
         SystemExit: they fail.
     """
-    if fails(tree, room, None):
-        sys.exit(f"tests/{room} fails in a copy without a change: {tree}")
+    if fails(room, None):
+        sys.exit(f"tests/{room} fails in a copy without a change: {TREE}")
     began = time.monotonic()
-    fails(tree, room, None)
+    fails(room, None)
     return time.monotonic() - began
 
 
-def judged(mutant: Mutant, tree: Path, timeout_s: float) -> Verdict:
+def judged(mutant: Mutant, timeout_s: float) -> Verdict:
     """Runs the tests of a mutant's room against it."""
-    path = tree / mutant.module
+    path = TREE / mutant.module
     source, changed = path.read_text(encoding="utf-8"), mutated(mutant)
     assert changed is not None
     path.write_text(changed, encoding="utf-8")
     try:
         outcome = {True: "killed", False: "survived", None: "timeout"}
-        verdict = outcome[fails(tree, mutant.room, timeout_s)]
+        verdict = outcome[fails(mutant.room, timeout_s)]
     finally:
         path.write_text(source, encoding="utf-8")
     before, after = _first_difference(source.splitlines(), changed.splitlines())
@@ -216,7 +216,7 @@ def _first_difference(before: list[str], after: list[str]) -> tuple[str, str]:
 
 def key_of(mutant: Mutant) -> str:
     """Returns what a verdict belongs to: the mutant, in a file of this content."""
-    content = (ROOT / mutant.module).read_bytes()
+    content = (TREE / mutant.module).read_bytes()
     named = f"{mutant.module} {mutant.operator} {mutant.occurrence} ".encode()
     return hashlib.sha256(named + content).hexdigest()
 
@@ -262,16 +262,17 @@ def main() -> None:
     options = parser.parse_args()
     os.nice(10)
     FOLDER.mkdir(parents=True, exist_ok=True)
-    verdict_of, tree = kept(), copied()
+    copy_checkout()
+    verdict_of = kept()
     timeouts: dict[str, float] = {}
     verdicts = []
     for number, mutant in enumerate(drawn(options.rooms, options.count, options.seed), start=1):
         key = key_of(mutant)
         if key not in verdict_of:
             if mutant.room not in timeouts:
-                usual = seconds_without_change(tree, mutant.room)
+                usual = seconds_without_change(mutant.room)
                 timeouts[mutant.room] = max(LEAST_TIMEOUT_S, SLOWER * usual)
-            verdict_of[key] = judged(mutant, tree, timeouts[mutant.room])
+            verdict_of[key] = judged(mutant, timeouts[mutant.room])
             keep(key, verdict_of[key])
         verdicts.append((mutant, verdict_of[key]))
         outcome = verdict_of[key].outcome

@@ -26,7 +26,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     path = tmp_path / "cfx" / "models" / "made.py"
     path.parent.mkdir(parents=True)
     path.write_text(SOURCE, encoding="utf-8")
-    monkeypatch.setattr(mutants, "ROOT", tmp_path)
+    monkeypatch.setattr(mutants, "TREE", tmp_path)
     monkeypatch.setattr(mutants, "FOLDER", tmp_path)
     return path
 
