@@ -27,7 +27,7 @@ _COLUMNS = 16
 _OPTIONS = ("-O3", "-ffp-contract=fast")
 """Sums of a product stay in registers, and are rounded once for a product and a sum."""
 
-_SOURCE = Path(__file__).with_suffix(".cpp")
+_SOURCE = Path(__file__).with_suffix(".cpp").read_text(encoding="utf-8")
 
 _ELEMENTWISE, _PRODUCT, _BOUND, _ADD = range(4)
 """Kinds of a call, as `calls.cpp` numbers them."""
@@ -69,7 +69,7 @@ class Calls:
     """
 
     def __init__(self) -> None:
-        library = compiler.build_library(_SOURCE.read_text(encoding="utf-8"), *_OPTIONS)
+        library = compiler.build_library(_SOURCE, *_OPTIONS)
         if library is None:
             raise Unsupported("there is no C++ compiler")
         self._run = library.run
