@@ -139,5 +139,5 @@ lock:
 	rm -rf .venv-lock
 
 clean:
-	rm -rf $(VENV) .venv-lock .venv-dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
+	rm -rf $(VENV) .venv-lock .venv-dist .mutants .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

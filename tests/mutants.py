@@ -5,10 +5,10 @@
 Cosmic Ray makes the mutants: another operator, comparison or number, a branch or a decorator left
 out. They are drawn by a seed, the place first and then the change, so that places with many possible
 changes do not outweigh others. What changes annotations alone is left out. Each mutant is a change
-of a copy of the checkout in `.cache/mutants`, and runs against the tests of its room there: the
+of a copy of the checkout in `.mutants`, and runs against the tests of its room there: the
 first failure kills it, as does a run of more than three times as long as without a change.
 
-Verdicts are kept in `.cache/mutants/verdicts.jsonl`, by the content of what was changed: a run that
+Verdicts are kept in `.mutants/verdicts.jsonl`, by the content of what was changed: a run that
 was interrupted goes on, and a mutant of a file that has changed since is tried again. The table of
 survivors lists each with its line before and after. Some cannot be noticed: a bound of memory, a
 number of things done at once, a digit beyond rounding. The others want a test.
@@ -34,7 +34,7 @@ from typing import Any, NamedTuple
 from tests.checkout import ROOT
 
 ROOMS = ("evaluation", "calibration", "learners", "policies", "simulation", "models")
-FOLDER = ROOT / ".cache" / "mutants"
+FOLDER = ROOT / ".mutants"
 TREE = FOLDER / "tree"
 """The copy of the checkout, whose files are changed and tested."""
 LEAST_TIMEOUT_S = 60.0
