@@ -385,10 +385,10 @@ class _Marginals(Model):
         # Without this, the few queries of a climb would be taken as dense and their diagonal
         # covariance filled up.
         with max_eager_kernel_size(0):
-            found = self._process.posterior(X.squeeze(-2).transpose(0, 1))
-            return _IndependentNormal(
-                found.mean.transpose(0, 1)[..., None], found.variance.transpose(0, 1)[..., None]
-            )
+            # (m, P, 1, n) -> (P, m, n), and back: (P, m) -> (m, P, 1).
+            posterior = self._process.posterior(X.squeeze(-2).transpose(0, 1))
+            mean = posterior.mean.transpose(0, 1)[..., None]
+            return _IndependentNormal(mean, posterior.variance.transpose(0, 1)[..., None])
 
 
 class _IndependentNormal(Posterior):

@@ -117,13 +117,13 @@ class GradientSearch(RandomSearch):
             search = _best(search, searches)
             for _ in range(rounds):
                 around = _around(search.point)
-                found = objective(around.flatten(1, 2))
-                search = _with_slope(search, around, found.view(around.shape[:3]))
+                beside = objective(around.flatten(1, 2))
+                search = _with_slope(search, around, beside.view(around.shape[:3]))
                 steps = _steps(search)
                 lower = objective(steps.flatten(1, 2))
                 search = _stepped(search, steps, lower.view(steps.shape[:3]))
                 tried += [around.flatten(1, 2), steps.flatten(1, 2)]
-                losses += [found, lower]
+                losses += [beside, lower]
         # The extra points stand before the searches, in the order of evaluation.
         return tuple(tried), torch.cat(losses, dim=1)
 
@@ -242,9 +242,10 @@ def _steps(search: _LocalSearches) -> Tensor:
     slope = search.slope
     blocked = ((search.point <= 0.0) & (slope > 0.0)) | ((search.point >= 1.0) & (slope < 0.0))
     free = slope.where(~blocked, 0.0)
-    wanted = -(search.inverse @ free[..., None]).squeeze(-1).where(~blocked, 0.0)
-    downhill = ((wanted * free).sum(-1) < 0.0) & ~search.fresh
-    step = wanted.where(downhill[..., None], -free)
+    # The quasi-Newton step -H g (Nocedal and Wright, 6.2), along the bounds where they block it.
+    newton = -(search.inverse @ free[..., None]).squeeze(-1).where(~blocked, 0.0)
+    downhill = ((newton * free).sum(-1) < 0.0) & ~search.fresh
+    step = newton.where(downhill[..., None], -free)
     longest = step.abs().amax(-1).clamp(min=1e-300)
     # Plain gradients have no scale: they go as far as they may.
     scale = search.radius / longest

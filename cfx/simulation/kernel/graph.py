@@ -177,7 +177,7 @@ class Recording:
     def __init__(self, inputs: Sequence[str]) -> None:
         self._inputs = iter(inputs)
         self._statements: list[Assignment] = []
-        self._known: dict[fx.Node, Any] = {}
+        self._expressions_of: dict[fx.Node, Any] = {}
 
     def function(
         self, graph: fx.Graph
@@ -185,16 +185,16 @@ class Recording:
         """Returns the statements, and the expressions of the columns of each result."""
         for node in graph.nodes:
             if node.op == "placeholder":
-                self._known[node] = array((1,), [next(self._inputs)])
+                self._expressions_of[node] = array((1,), [next(self._inputs)])
             elif node.op == "call_function":
-                self._known[node] = self._computed(node)
+                self._expressions_of[node] = self._computed(node)
             elif node.op == "get_attr":
-                self._known[node] = _constant(graph, node)
+                self._expressions_of[node] = _constant(graph, node)
             elif node.op == "output":
                 returned: Any = node.args[0]
                 results = []
                 for value in returned:
-                    results.append(tuple(map(str, self._known[value].flat)))
+                    results.append(tuple(map(str, self._expressions_of[value].flat)))
                 return tuple(self._statements), tuple(results)
         raise Unsupported("it returns nothing")
 
@@ -203,7 +203,7 @@ class Recording:
         value = node.meta.get("val")
         move = MOVES.get(operation_of(node))
         if move is not None:
-            moved = move(node, self._known)
+            moved = move(node, self._expressions_of)
             if isinstance(value, Tensor):
                 return self._named(moved.reshape(shape_of(value)), value)
             return moved
@@ -216,7 +216,7 @@ class Recording:
         operands: list[Expressions] = []
         for argument in node.args:
             if isinstance(argument, fx.Node):
-                operands.append(broadcast(self._known[argument], shape))
+                operands.append(broadcast(self._expressions_of[argument], shape))
             else:
                 operands.append(broadcast(array((), [_number(argument)]), shape))
         computed = []
