@@ -44,7 +44,7 @@ from .data.files import (
 )
 from .data.pairs import Dropped as Dropped, Pair as Pair, PairBatch as PairBatch, PairSet as PairSet
 from .data.pairs import Remark as Remark
-from .data.signals import COARSE_S as COARSE_S
+from .data.resampling import COARSE_S as COARSE_S
 from .data.sites import with_sites as with_sites
 from .data.style import (
     ALL_TYPES as ALL_TYPES,

@@ -18,11 +18,12 @@ from cfx.core import memory, registry
 from cfx.core.component import Component, Distinct, Settings
 from cfx.core.files import absolute
 from cfx.core.storage import is_url, local_copies
+from cfx.data.accelerations import Accelerations, with_usable_accelerations
 from cfx.data.check import Check, check_pairs
 from cfx.data.files import FileStart, recording_of, stem
 from cfx.data.names import Name
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet, Remark
-from cfx.data.signals import Accelerations, resampled, scaled, with_usable_accelerations
+from cfx.data.resampling import resampled, scaled
 from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
 from cfx.data.tracks import summed
 from cfx.errors import DataError, PluginError, listed, nearest

@@ -23,7 +23,7 @@ from cfx.data.check import Check, judge
 from cfx.data.files import Floats, beginning, partitions
 from cfx.data.pairs import Dropped, Pair, PairSet
 from cfx.data.plausible import doubts, rare
-from cfx.data.signals import frames_in_steps
+from cfx.data.resampling import frames_in_steps
 from cfx.data.style import (
     ALL_TYPES,
     INDICATORS,

@@ -30,7 +30,7 @@ from cfx.core.storage import is_url
 from cfx.core.threads import limit_cores, set_threads
 from cfx.data.base import Dataset
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.signals import COARSE_S
+from cfx.data.resampling import COARSE_S
 from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.errors import ConfigError, PluginError
 from cfx.evaluation.demo import Demo

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
-from cfx.data.signals import resampled
+from cfx.data.resampling import resampled
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.errors import ConfigError
 
