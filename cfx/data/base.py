@@ -22,8 +22,9 @@ from cfx.data.accelerations import Accelerations, with_usable_accelerations
 from cfx.data.check import Check, check_pairs
 from cfx.data.files import FileStart, recording_of, stem
 from cfx.data.names import Name
-from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet, Remark
+from cfx.data.pairs import Dropped, Pair, PairSet, Remark
 from cfx.data.resampling import resampled, scaled
+from cfx.data.signals import RECORDED
 from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
 from cfx.data.tracks import summed
 from cfx.errors import DataError, PluginError, listed, nearest
@@ -287,11 +288,17 @@ class Dataset(Component):
                 f" but returned a {type(pairs).__name__}"
             )
         for pair in pairs:
-            for name in SIGNALS:
+            for name in RECORDED:
                 if not bool(np.isfinite(getattr(pair, name)).all()):
                     raise PluginError(
                         f"{registry.origin(self)}: pair {pair.pair_id} has a {name} that is not"
                         " finite; a dataset splits or leaves out what has gaps"
+                    )
+            for signal, values in pair.surroundings.items():
+                if not bool(np.isfinite(values).all()):
+                    raise PluginError(
+                        f"{registry.origin(self)}: pair {pair.pair_id} has a {signal.name} that is"
+                        " not finite; a dataset splits or leaves out what has gaps"
                     )
 
 

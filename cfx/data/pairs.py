@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from cfx.core import memory
 from cfx.data.names import name_of
+from cfx.data.signals import RECORDED, Signal
 from cfx.errors import DataError
 
 if TYPE_CHECKING:
@@ -26,14 +27,6 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Array = NDArray[np.float64]
-SIGNALS = (
-    "leader_position",
-    "leader_speed",
-    "leader_acceleration",
-    "follower_position",
-    "follower_speed",
-    "follower_acceleration",
-)
 
 _LIKENESS_FRAMES = 8
 """Frames of a pair at which its likeness is taken."""
@@ -67,6 +60,7 @@ class Pair:
         site: the road or area that the recording was made at; several recordings may share one.
         vehicle: the follower's name over all recordings, "" where ids mean something within one
             recording alone.
+        surroundings: further signals, as measured, `(T,)` each (`cfx.data.signals`).
         truth: true parameters over time, name -> `(T,)`, known only for synthetic pairs.
         truth_model: name of the model these parameters belong to.
     """
@@ -91,11 +85,14 @@ class Pair:
     leader_driver_type: str = ""
     site: str = ""
     vehicle: str = ""
+    surroundings: Mapping[Signal, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("pair_id", "recording", "leader_id", "follower_id"):
             object.__setattr__(self, name, name_of(getattr(self, name)))
-        shapes = {name: getattr(self, name).shape for name in SIGNALS}
+        shapes = {name: getattr(self, name).shape for name in RECORDED}
+        for signal, values in self.surroundings.items():
+            shapes[signal.name] = values.shape
         if len(set(shapes.values())) != 1 or len(shapes["leader_position"]) != 1:
             raise DataError(
                 f"pair {self.pair_id}: all signals must have the same length, got {shapes}"
@@ -115,6 +112,15 @@ class Pair:
         """Says whether the pair lasts so many seconds at least; one frame alone lasts no time."""
         # A share of a frame less than a millionth is rounding: 70 s are 700 frames of 0.1 s.
         return len(self) >= max(2.0, duration / self.dt - 1e-6)
+
+    def beginning(self, frames: int) -> Pair:
+        """Returns the pair over its first frames; all of it where it has no more."""
+        signals: dict[str, Any] = {name: getattr(self, name)[:frames] for name in RECORDED}
+        truth = {name: values[:frames] for name, values in self.truth.items()}
+        surroundings = {}
+        for signal, values in self.surroundings.items():
+            surroundings[signal] = values[:frames]
+        return replace(self, **signals, truth=truth, surroundings=surroundings)
 
     @property
     def driver(self) -> str:
@@ -156,8 +162,11 @@ class Pair:
 
     def _digest(self, header: str) -> str:
         digest = hashlib.sha256(header.encode())
-        for name in SIGNALS:
+        for name in RECORDED:
             digest.update(np.ascontiguousarray(getattr(self, name), dtype=np.float64).tobytes())
+        for signal, values in self.surroundings.items():
+            digest.update(repr(signal).encode())
+            digest.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
         return digest.hexdigest()
 
 
@@ -281,7 +290,7 @@ class PairSet(Sequence[Pair]):
     @property
     def size(self) -> int:
         """Bytes of all signals."""
-        return len(SIGNALS) * 8 * sum(len(pair) for pair in self.pairs)
+        return 8 * sum(len(pair) * (len(RECORDED) + len(pair.surroundings)) for pair in self.pairs)
 
     def changed(self, change: Callable[[Pair], Pair | None]) -> PairSet:
         """Returns changed pairs, without those of which None is left.
@@ -308,8 +317,10 @@ class PairSet(Sequence[Pair]):
         Raises:
             OutputError: the disk is full.
         """
-        sizes = [len(pair) * (len(SIGNALS) + len(pair.truth)) for pair in self.pairs]
-        free = memory.in_file((sum(sizes),))
+        size = 0
+        for pair in self.pairs:
+            size += len(pair) * (len(RECORDED) + len(pair.truth) + len(pair.surroundings))
+        free = memory.in_file((size,))
         stored = []
 
         def kept(array: Array) -> Array:
@@ -319,9 +330,10 @@ class PairSet(Sequence[Pair]):
             return row
 
         for pair in self:
-            signals: dict[str, Any] = {name: kept(getattr(pair, name)) for name in SIGNALS}
+            signals: dict[str, Any] = {name: kept(getattr(pair, name)) for name in RECORDED}
             truth = {name: kept(array) for name, array in pair.truth.items()}
-            stored.append(replace(pair, **signals, truth=truth))
+            surroundings = {signal: kept(array) for signal, array in pair.surroundings.items()}
+            stored.append(replace(pair, **signals, truth=truth, surroundings=surroundings))
         return replace(self, pairs=tuple(stored))
 
     def take(self, numbers: Sequence[int]) -> PairSet:
@@ -352,6 +364,25 @@ class PairSet(Sequence[Pair]):
         return steps[0]
 
     @property
+    def surroundings(self) -> tuple[Signal, ...]:
+        """The further signals, which every pair has.
+
+        Raises:
+            DataError: a pair has others than the first one.
+        """
+        signals: tuple[Signal, ...] = ()
+        if self.pairs:
+            signals = tuple(self.pairs[0].surroundings)
+        for pair in self.pairs:
+            if set(pair.surroundings) != set(signals):
+                expected = ", ".join(signal.name for signal in signals) or "none"
+                raise DataError(
+                    f"{self.source}: pair {pair.pair_id} has other further signals than the first"
+                    f" pair ({expected}); give every pair the same"
+                )
+        return signals
+
+    @property
     def fingerprint(self) -> str:
         """SHA-256 over all pairs, in order."""
         digest = hashlib.sha256()
@@ -374,6 +405,8 @@ class PairBatch:
         lengths: `(P,)` int64, frames of each pair.
         mask: `(P, T)` bool, True within the pair.
         dt: time step, s.
+        surroundings: further signals, `(P, T)` each; in place of a gap the position of what is
+            ahead is stored, which does not depend on where the follower is (`Signal.seen_from`).
     """
 
     leader_position: Tensor
@@ -386,6 +419,7 @@ class PairBatch:
     lengths: Tensor
     mask: Tensor
     dt: float
+    surroundings: Mapping[Signal, Tensor] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -416,12 +450,18 @@ class PairBatch:
         length = max(frames, *(len(pair) for pair in pair_set.pairs))
         shape = (len(pair_set), length)
         signals = {}
-        for name in SIGNALS:
+        for name in RECORDED:
             # Filled row by row: a list of rows would hold the signal twice.
-            values = memory.empty(shape, together=len(SIGNALS))
+            values = memory.empty(shape, together=len(RECORDED))
             for row, pair in zip(values, pair_set, strict=True):
                 row[:] = _extend(pair, name, length)
             signals[name] = torch.as_tensor(values).to(device=device, dtype=dtype)
+        surroundings = {}
+        for signal in pair_set.surroundings:
+            values = memory.empty(shape, together=len(pair_set.surroundings))
+            for row, pair in zip(values, pair_set, strict=True):
+                row[:] = _extended_surroundings(pair, signal, length)
+            surroundings[signal] = torch.as_tensor(values).to(device=device, dtype=dtype)
         leader_lengths = [pair.leader_length for pair in pair_set.pairs]
         lengths = torch.tensor([len(pair) for pair in pair_set.pairs])
         mask = torch.as_tensor(memory.empty(shape, bool))
@@ -432,6 +472,7 @@ class PairBatch:
             lengths=lengths.to(device),
             mask=mask.to(device),
             dt=dt,
+            surroundings=surroundings,
         )
 
     def __len__(self) -> int:
@@ -459,23 +500,42 @@ class PairBatch:
         return replace(self, lengths=last + 1, mask=mask).trimmed()
 
     def followed_by(self, other: PairBatch) -> PairBatch:
-        """Returns these pairs and those of another batch with room for as many frames."""
+        """Returns these pairs and those of another batch with room for as many frames.
+
+        Raises:
+            DataError: only one of them has a further signal.
+        """
         import torch
 
-        joined: dict[str, Any] = {}
-        for one in fields(self):
-            if one.name != "dt":
-                ours, theirs = getattr(self, one.name), getattr(other, one.name)
-                joined[one.name] = torch.cat([ours, theirs.to(ours)])
-        return replace(self, **joined)
+        if set(self.surroundings) != set(other.surroundings):
+            names = {signal.name for signal in {*self.surroundings} ^ {*other.surroundings}}
+            raise DataError(
+                f"pairs with and without the signal {' and '.join(sorted(names))} cannot be used"
+                " together; give it to all of them, or leave out the inputs of policies that read"
+                " it"
+            )
+
+        def joined(ours: Tensor, theirs: Tensor) -> Tensor:
+            return torch.cat([ours, theirs.to(ours)])
+
+        changed: dict[str, Any] = {}
+        for name in _TENSORS:
+            changed[name] = joined(getattr(self, name), getattr(other, name))
+        surroundings = {}
+        for signal, values in self.surroundings.items():
+            surroundings[signal] = joined(values, other.surroundings[signal])
+        return replace(self, **changed, surroundings=surroundings)
 
     def trimmed(self) -> PairBatch:
         """Returns the same pairs without the frames that none of them has."""
         frames = int(self.lengths.max())
         signals: dict[str, Any] = {}
-        for name in (*SIGNALS, "mask"):
+        for name in (*RECORDED, "mask"):
             signals[name] = getattr(self, name)[:, :frames]
-        return replace(self, **signals)
+        surroundings = {}
+        for signal, values in self.surroundings.items():
+            surroundings[signal] = values[:, :frames]
+        return replace(self, **signals, surroundings=surroundings)
 
     def __getitem__(self, index: Any) -> PairBatch:
         """Selects pairs (a slice, an index tensor or a boolean mask over P); time stays whole."""
@@ -486,10 +546,16 @@ class PairBatch:
     def _changed(self, change: Callable[[Tensor], Tensor]) -> PairBatch:
         """Returns these pairs with each of their tensors changed."""
         changed: dict[str, Any] = {}
-        for one in fields(self):
-            if one.name != "dt":
-                changed[one.name] = change(getattr(self, one.name))
-        return replace(self, **changed)
+        for name in _TENSORS:
+            changed[name] = change(getattr(self, name))
+        surroundings = {}
+        for signal, values in self.surroundings.items():
+            surroundings[signal] = change(values)
+        return replace(self, **changed, surroundings=surroundings)
+
+
+_TENSORS = (*RECORDED, "leader_length", "lengths", "mask")
+"""The tensors of a batch, its surroundings apart."""
 
 
 def _selected(values: Tensor, index: Any) -> Tensor:
@@ -500,7 +566,7 @@ def _selected(values: Tensor, index: Any) -> Tensor:
     if not is_copy or values.device.type != "cpu":
         return values[index]
     size = len(index) * values.shape[1] * values.itemsize
-    if len(SIGNALS) * size < memory.LARGE:
+    if len(RECORDED) * size < memory.LARGE:
         return values[index]
     rows = memory.in_file((len(index), values.shape[1]), values[:0].numpy().dtype)
     return torch.index_select(values, 0, index, out=torch.as_tensor(rows))
@@ -520,4 +586,23 @@ def _extend(pair: Pair, name: str, length: int) -> Array:
         tail = np.full(missing, last)
         origin = 0.0
     extended: Array = np.concatenate([values, tail]) - origin
+    return extended
+
+
+def _extended_surroundings(pair: Pair, signal: Signal, length: int) -> Array:
+    """Returns a further signal `(length,)` as a batch stores it, continued beyond the end.
+
+    What is ahead goes on at the leader's last speed, there is no acceleration, and everything else
+    stays as it was.
+    """
+    values = np.asarray(pair.surroundings[signal], dtype=np.float64)
+    beyond = np.arange(1, length - len(values) + 1)
+    last = values[-1]
+    if signal.quantity == "acceleration":
+        last = 0.0
+    tail: Array = np.full(len(beyond), last)
+    if signal.quantity == "gap":
+        values = values + pair.follower_position - float(pair.follower_position[0])
+        tail = values[-1] + float(pair.leader_speed[-1]) * pair.dt * beyond
+    extended: Array = np.concatenate([values, tail])
     return extended

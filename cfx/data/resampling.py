@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
+from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.signals import RECORDED
 
 _ROUNDING = 1e-6
 """Share of a step by which a recording may end before a frame of the new step and still have it."""
@@ -55,16 +56,19 @@ def _pair(pair: Pair, step: float) -> Pair | None:
     if len(at) < 2:
         return None
     at = at.clip(max=last)
-    recorded = [np.asarray(getattr(pair, name), dtype=np.float64) for name in SIGNALS]
+    recorded = [np.asarray(getattr(pair, name), dtype=np.float64) for name in RECORDED]
+    for values in pair.surroundings.values():
+        recorded.append(np.asarray(values, dtype=np.float64))
     # The interpolator divides by slopes; an infinite quotient of a slope near 0 makes the slope 0.
     with np.errstate(over="ignore"):
         values = PchipInterpolator(np.arange(len(pair)), np.stack(recorded), axis=1)(at)
-    signals = dict(zip(SIGNALS, values, strict=True))
+    signals = dict(zip(RECORDED, values[: len(RECORDED)], strict=True))
+    surroundings = dict(zip(pair.surroundings, values[len(RECORDED) :], strict=True))
     before = np.floor(at + _ROUNDING).astype(np.int64)
     truth = {}
     for name, value in pair.truth.items():
         truth[name] = np.asarray(value)[before]
-    return replace(pair, dt=step, truth=truth, **signals)
+    return replace(pair, dt=step, truth=truth, surroundings=surroundings, **signals)
 
 
 def scaled(pairs: PairSet, factor: float) -> PairSet:
@@ -76,10 +80,15 @@ def scaled(pairs: PairSet, factor: float) -> PairSet:
         return pairs
 
     def scale(pair: Pair) -> Pair:
-        signals = {name: getattr(pair, name) * factor for name in SIGNALS}
+        signals = {name: getattr(pair, name) * factor for name in RECORDED}
         # The leader's rear bumper is scaled, then its length added again.
         signals["leader_position"] = signals["leader_position"] + pair.leader_length * (1 - factor)
-        return replace(pair, **signals)
+        surroundings = {}
+        for signal, values in pair.surroundings.items():
+            surroundings[signal] = values
+            if signal.is_scaled:
+                surroundings[signal] = values * factor
+        return replace(pair, **signals, surroundings=surroundings)
 
     source = f"{pairs.source}, {factor:g} times as fast"
     return replace(pairs.changed(scale), source=source)

@@ -61,6 +61,7 @@ class FileColumn:
         whole: whether its numbers are whole.
         least: smallest number that is possible.
         above: every number is greater than this.
+        most: largest number that is possible.
         wrong: what is wrong with a number that is not whole or out of bounds, and what to do.
         called: the file's own name of the column, under which alone it is looked for; "": its name.
         factor: what the file's numbers are multiplied by once they are checked.
@@ -77,6 +78,7 @@ class FileColumn:
     whole: bool = False
     least: float = -np.inf
     above: float = -np.inf
+    most: float = np.inf
     wrong: str = ""
     called: str = ""
     factor: float = 1.0
@@ -405,7 +407,7 @@ def _require_numbers(table: Table, name: str, values: Floats, column: FileColumn
             f"{table.at(at[0], name)}: the cell is {what} ({len(at)} such cells in this column);"
             f" {table.layout.remedy}"
         )
-    wrong = (values < column.least) | (values <= column.above)
+    wrong = (values < column.least) | (values <= column.above) | (values > column.most)
     if column.whole:
         wrong |= (values != np.floor(values)) & ~np.isnan(values)
     table.refuse(name, wrong, column.wrong)

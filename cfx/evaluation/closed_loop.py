@@ -26,7 +26,7 @@ from cfx.models.composed import Combined, for_both
 from cfx.models.limits import at_limits
 from cfx.policies.agent import Agent, AgentState, TrainedOn
 from cfx.policies.context import DriverContext
-from cfx.policies.features import History
+from cfx.policies.history import History
 from cfx.policies.valid_range import share_in_words
 from cfx.simulation.base import Stepper
 from cfx.simulation.trajectory import Start
@@ -195,6 +195,9 @@ class _Track:
             batch.leader_acceleration.gather(1, index),
             batch.leader_length[:, None],
         )
+        self._surroundings = {}
+        for declared, stored in batch.surroundings.items():
+            self._surroundings[declared] = stored.gather(1, index)
         self._position = batch.follower_position.gather(1, index)
         self.speed = batch.follower_speed.gather(1, index)
         self._acceleration = batch.follower_acceleration.gather(1, index)
@@ -215,13 +218,17 @@ class _Track:
     def history(self, begin: int) -> History:
         """Returns the L frames up to step `begin`, `(P, L)` each."""
         recent = slice(begin, begin + self._length)
-        return History(
-            self._leader.speed[:, recent],
-            self._leader.acceleration[:, recent],
-            self.speed[:, recent],
-            self._acceleration[:, recent],
-            self._gap[:, recent],
-        )
+        history = {
+            "leader_speed": self._leader.speed[:, recent],
+            "leader_acceleration": self._leader.acceleration[:, recent],
+            "follower_speed": self.speed[:, recent],
+            "follower_acceleration": self._acceleration[:, recent],
+            "gap": self._gap[:, recent],
+        }
+        for signal, stored in self._surroundings.items():
+            seen = signal.seen_from(self._position[:, recent], stored[:, recent])
+            history[signal.name] = seen
+        return history
 
     def leader(self, begin: int, end: int) -> Leader:
         """Returns the leaders at steps `begin` to `end - 1`, time first."""

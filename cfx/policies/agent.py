@@ -29,9 +29,10 @@ from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.context import UNSEEN, ContextRule, DriverContext, ExpectedError
 from cfx.policies.core import ANY_DRIVER, AgentCore, driver_places
 from cfx.policies.driver_features import measure
-from cfx.policies.features import History, Scaler, measured_history
+from cfx.policies.features import Scaler
 from cfx.policies.heads.base import ParameterHead
 from cfx.policies.heads.offset import blended, shrunk
+from cfx.policies.history import History, measured_history
 from cfx.policies.valid_range import RANGE_SIGNALS, ValidRange, situation_of, weight_of_answer
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import WindowSettings
@@ -373,7 +374,8 @@ class Agent:
 
         from cfx.data.tidy import pairs_from_frame
 
-        pairs = pairs_from_frame(frame, source="the table given to the policy")
+        source = "the table given to the policy"
+        pairs = pairs_from_frame(frame, source, signals=self.core.further_signals)
         if abs(pairs.dt - self.dt) > 1e-6:
             raise DataError(
                 f"the policy was trained at time steps of {self.dt:g} s, the table has"
@@ -451,7 +453,7 @@ class Agent:
     def _answer(self, history: History, state: AgentState) -> tuple[Tensor, AgentState]:
         """Returns the networks' answers `(D, n)`, in the history's dtype, and their state."""
         answers, after = self.core.answer(self._features(history, state), state.state)
-        answer = answers[state.network, state.place].to(history.follower_speed.dtype)
+        answer = answers[state.network, state.place].to(history["follower_speed"].dtype)
         return answer, state._replace(state=after)
 
     def _apply(

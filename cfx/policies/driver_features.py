@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch
-from cfx.policies.features import History
+from cfx.policies.history import History, changed, history_of
 
 MOVING = 2.0
 """m/s: frames in which the follower is slower say nothing of their time headway."""
@@ -67,7 +67,7 @@ class Measured(NamedTuple):
     @property
     def moving(self) -> Tensor:
         """The frames of the part in which the follower moves, bool `(P, T)`."""
-        return self.counted & (self.signals.follower_speed > MOVING)
+        return self.counted & (self.signals["follower_speed"] > MOVING)
 
 
 def _mean(values: Tensor, counted: Tensor) -> Tensor:
@@ -81,16 +81,16 @@ def _log_rms(values: Tensor, counted: Tensor) -> Tensor:
 
 def _time_headway(m: Measured) -> Tensor:
     """The mean logarithm of gap (m) over speed (m/s)."""
-    speed = m.signals.follower_speed.clamp(min=MOVING)
-    headway = m.signals.gap.clamp(min=_LEAST_GAP) / speed
+    speed = m.signals["follower_speed"].clamp(min=MOVING)
+    headway = m.signals["gap"].clamp(min=_LEAST_GAP) / speed
     return _mean(headway.log(), m.moving)
 
 
 def _time_gap(m: Measured) -> Tensor:
     """By how much the gap grows with speed, s: ridge regression, as speed may hardly vary."""
-    speed = m.signals.follower_speed
+    speed = m.signals["follower_speed"]
     speed = speed - _mean(speed, m.counted)[:, None]
-    gap = m.signals.gap
+    gap = m.signals["gap"]
     gap = gap - _mean(gap, m.counted)[:, None]
     covariance = _mean(speed * gap, m.counted)
     variance = _mean(speed.square(), m.counted)
@@ -99,18 +99,18 @@ def _time_gap(m: Measured) -> Tensor:
 
 def _standstill_gap(m: Measured) -> Tensor:
     """The gap that this regression leaves at standstill, m."""
-    speed = _mean(m.signals.follower_speed, m.counted)
-    return _mean(m.signals.gap, m.counted) - _time_gap(m) * speed
+    speed = _mean(m.signals["follower_speed"], m.counted)
+    return _mean(m.signals["gap"], m.counted) - _time_gap(m) * speed
 
 
 def _speed_difference(m: Measured) -> Tensor:
     """The logarithm of the root mean square of the difference to the leader's speed, m/s."""
-    return _log_rms(m.signals.leader_speed - m.signals.follower_speed, m.counted)
+    return _log_rms(m.signals["leader_speed"] - m.signals["follower_speed"], m.counted)
 
 
 def _acceleration(m: Measured) -> Tensor:
     """The logarithm of the root mean square acceleration, m/s2."""
-    return _log_rms(m.signals.follower_acceleration, m.counted)
+    return _log_rms(m.signals["follower_acceleration"], m.counted)
 
 
 def _response_time(m: Measured) -> Tensor:
@@ -125,8 +125,8 @@ def _response_time(m: Measured) -> Tensor:
     variances = []
     for delay in delays:
         both = m.counted[:, delay:] & m.counted[:, : frames - delay]
-        leader = m.signals.leader_speed[:, : frames - delay]
-        apart = m.signals.follower_speed[:, delay:] - leader
+        leader = m.signals["leader_speed"][:, : frames - delay]
+        apart = m.signals["follower_speed"][:, delay:] - leader
         variances.append(_mean((apart - _mean(apart, both)[:, None]).square(), both))
     variance = torch.stack(variances, 1)
     least = variance.min(1, keepdim=True).values
@@ -167,7 +167,7 @@ def measure(
     """
     frame = torch.arange(batch.mask.shape[1], device=until.device)
     counted = batch.mask & (frame >= since[:, None]) & (frame < until[:, None])
-    measured = Measured(History.of(batch).double(), counted, dt)
+    measured = Measured(changed(history_of(batch), torch.Tensor.double), counted, dt)
     values = torch.stack([DRIVER_FEATURES[name](measured) for name in names], -1)
     known = measured.moving.sum(1) * dt >= LEAST
     return torch.where(known[:, None], values, torch.nan)

@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch
-from cfx.policies.features import History
+from cfx.policies.history import History, changed
 
 FADED = 2.5
 """Score from which on nothing is left of an agent's answer. Nearer bounds are worse: mixtures of an
@@ -122,14 +122,20 @@ class ValidRange(NamedTuple):
 
 def situation_of(history: History) -> Tensor:
     """Returns the situations at the last frame of histories `(*batch, L)`, `(*batch, f)`."""
-    return situations(History(*(signal[..., -1] for signal in history)))
+    return situations(changed(history, lambda signal: signal[..., -1]))
 
 
-def situations(h: History) -> Tensor:
+def situations(history: History) -> Tensor:
     """Returns situations `(*batch, f)` of signals `(*batch,)` each, SI units."""
-    relative_speed, log_gap = h.leader_speed - h.follower_speed, (h.gap.clamp(min=0.0) + 1.0).log()
-    acceleration, of_leader = h.follower_acceleration, h.leader_acceleration
-    return torch.stack([h.follower_speed, acceleration, of_leader, relative_speed, log_gap], -1)
+    speed = history["follower_speed"]
+    values = {
+        "follower_speed": speed,
+        "follower_acceleration": history["follower_acceleration"],
+        "leader_acceleration": history["leader_acceleration"],
+        "relative_speed": history["leader_speed"] - speed,
+        "log_gap": (history["gap"].clamp(min=0.0) + 1.0).log(),
+    }
+    return torch.stack([values[name] for name in RANGE_SIGNALS], -1)
 
 
 def weight_of_answer(score: Tensor) -> Tensor:

@@ -12,8 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfx.data.kinematics import contradiction, contradictions, typical_contradiction
-from cfx.data.pairs import SIGNALS, Pair, PairSet
+from cfx.data.pairs import Pair, PairSet
 from cfx.data.plausible import doubts
+from cfx.data.signals import RECORDED
 from cfx.data.tidy import TidyDataset
 from cfx.data.tracks import driven
 from cfx.models.krauss import Krauss
@@ -184,7 +185,7 @@ THINNED = "openacc_ispra_low_speed_pairs.parquet"
 
 def every(step: int, pair: Pair) -> Pair:
     """Returns a pair of which every so many frames are kept."""
-    signals = {name: getattr(pair, name)[::step] for name in SIGNALS}
+    signals = {name: getattr(pair, name)[::step] for name in RECORDED}
     return replace(pair, dt=pair.dt * step, **signals)
 
 

@@ -18,8 +18,8 @@ from cfx.models.krauss import Krauss
 from cfx.policies.checkpoint import load_agent, save_agent
 from cfx.policies.context import DriverContext
 from cfx.policies.core import group_by
-from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
+from cfx.policies.history import measured_history
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, Windows, WindowSettings
 from cfx_contracts import check_contract

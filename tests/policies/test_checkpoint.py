@@ -15,7 +15,7 @@ from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.context import ContextRule, DriverContext
-from cfx.policies.features import measured_history
+from cfx.policies.history import measured_history
 from tests.agents import adaptive
 from tests.drives import wavy_pairs
 

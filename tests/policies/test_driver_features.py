@@ -24,10 +24,11 @@ from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.context import DriverContext
 from cfx.policies.driver_features import DRIVER_FEATURES, LEAST, MOVING, measure
-from cfx.policies.features import History, measured_history
 from cfx.policies.gru import GruPolicy
+from cfx.policies.history import measured_history
 from tests.agents import adaptive
 from tests.drives import straight_pairs, wavy_pairs
+from tests.histories import observed
 
 ALL = tuple(DRIVER_FEATURES)
 PARAMETERS = torch.tensor([[1.0, 0.1], [1.8, 0.5], [3.0, 0.4]]).double()
@@ -128,7 +129,7 @@ def one_that_knows() -> Agent:
 
 
 def first_answer(policy: Agent, driver_features: list[float] | None) -> list[float]:
-    now = History(
+    now = observed(
         *(
             torch.full((1, policy.windows.length), value).double()
             for value in (8.0, 0.1, 9.0, -0.2, 15.0)
@@ -157,7 +158,7 @@ def test_a_saved_policy_uses_the_same_driver_features(tmp_path: Path) -> None:
         checkpoint.load_agent(tmp_path),
         checkpoint.load_agent(tmp_path).for_unseen_drivers(),
     ):
-        now = History(
+        now = observed(
             *(torch.full((1, 5), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0))
         )
         network = torch.tensor([len(again.names) - 1])

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cfx.core.parameters import ParameterSpace
 from cfx.models.base import DrivingModel
-from cfx.policies.features import History
+from cfx.policies.history import History
 
 
 class ParameterHead(ABC):

@@ -15,7 +15,8 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.gradient_search import GradientSearch
 from cfx.calibration.shards import Solver
-from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import RECORDED
 from cfx.errors import ConfigError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.forecasts import Origins
@@ -205,7 +206,7 @@ def test_recalibration_is_the_calibration_of_the_latest_history() -> None:
     )
     cut = []
     for pair in pairs:
-        signals = {name: getattr(pair, name)[until + 1 - kept : until + 1] for name in SIGNALS}
+        signals = {name: getattr(pair, name)[until + 1 - kept : until + 1] for name in RECORDED}
         cut.append(type(pair)(**{**vars(pair), **signals}))
     latest = PairSet(tuple(cut), "the latest history")
     calibrator = Calibrator(

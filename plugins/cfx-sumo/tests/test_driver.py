@@ -48,7 +48,7 @@ def counted(policy: Agent, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     original = Agent.act
 
     def act(self: Agent, history: Any, state: Any, **options: Any) -> tuple[Tensor, Any]:
-        calls.append(len(history.gap))
+        calls.append(len(history["gap"]))
         return original(self, history, state, **options)
 
     monkeypatch.setattr(Agent, "act", act)

@@ -18,7 +18,8 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import RECORDED
 from cfx.data.tidy import write_tidy
 from cfx.errors import DataError
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
@@ -29,13 +30,13 @@ from cfx.models.krauss import Krauss
 from cfx.policies.base import Policy
 from cfx.policies.constant import DefaultPolicy, FixedPolicy
 from cfx.policies.core import Ensemble
-from cfx.policies.features import History
 from cfx.policies.gru import GruPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split, WindowSettings
 from cfx_contracts import protocols
 from tests.drives import straight_pairs, wavy_pairs
+from tests.histories import observed
 
 QUICK = [
     "debug=quick",
@@ -443,7 +444,7 @@ def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> No
         policy.network.get_parameter("members.b_out").data.fill_(
             20.0
         )  # as large an answer as there is
-        silence = History(
+        silence = observed(
             *(torch.zeros((1, policy.windows.length), dtype=torch.float64) for _ in range(5))
         )
         anywhere = replace(policy, valid_range=None)  # it has learned nothing from silence
@@ -531,7 +532,7 @@ def test_trajectories_that_are_too_short_to_test_change_what_is_learned(tmp_path
     )
     cut = []
     for pair, count in zip(pairs, frames, strict=True):
-        signals: dict[str, Any] = {name: getattr(pair, name)[:count] for name in SIGNALS}
+        signals: dict[str, Any] = {name: getattr(pair, name)[:count] for name in RECORDED}
         cut.append(replace(pair, **signals))
     write_tidy(PairSet(tuple(cut), "test"), tmp_path / "pairs.csv")
     options = [

@@ -13,7 +13,7 @@ from cfx.app import cli
 from cfx.app.job.steps import Parts, complete, make_protocol
 from cfx.errors import DataError
 from cfx.policies import checkpoint, ready
-from cfx.policies.features import History
+from tests.histories import observed
 
 NAMES = ready.names()
 
@@ -39,7 +39,7 @@ def test_each_drives_an_unseen_driver(name: str) -> None:
     assert agent.valid_range is not None
     assert agent.trained_on.quantiles
     frames = torch.full((1, agent.windows.length), 10.0, dtype=torch.float64)
-    history = History(frames, frames * 0, frames, frames * 0, frames * 2)
+    history = observed(frames, frames * 0, frames, frames * 0, frames * 2)
     chosen, state = agent.act(history, agent.begin(torch.zeros(1, dtype=torch.int64)))
     low, high = agent.space.bounds()
     assert bool(((chosen >= low - 1e-9) & (chosen <= high + 1e-9)).all())
@@ -79,7 +79,7 @@ def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated(name: str, lea
     agent = cfx.load(f"cfx://{name}").policy
     assert agent.is_stochastic
     frames = torch.full((2, agent.windows.length), 10.0, dtype=torch.float64)
-    history = History(frames, frames * 0, frames, frames * 0, frames * 2)
+    history = observed(frames, frames * 0, frames, frames * 0, frames * 2)
 
     def chosen(seed: int | None) -> torch.Tensor:
         generator = None if seed is None else torch.Generator().manual_seed(seed)

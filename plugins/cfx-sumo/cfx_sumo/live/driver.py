@@ -22,7 +22,14 @@ import torch
 from torch import Tensor
 
 from cfx.errors import DataError, SumoError
-from cfx.plugin import ANY_DRIVER, Agent, DrivingModel, create, one_thread
+from cfx.plugin import (
+    ANY_DRIVER,
+    Agent,
+    DrivingModel,
+    create,
+    one_thread,
+    require_no_further_signals,
+)
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.control import VehicleControl
@@ -136,7 +143,9 @@ class Driver:
         Raises:
             DataError: `look_ahead` is no distance; the policy has no such network; or its driving
                 model has equations in SUMO only, or may brake harder than a vehicle can.
+            ConfigError: an input of the policy reads what SUMO does not give.
         """
+        require_no_further_signals(policy.core.inputs, "SUMO")
         if not look_ahead > 0:
             raise DataError(
                 f"look_ahead={look_ahead:g}: give a distance above 0 m within which a leader counts"

@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.plugin import Agent, AgentState, DriverContext, History
+from cfx.plugin import OBSERVED, Agent, AgentState, DriverContext, History
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.draws import standard_normal
@@ -145,4 +145,4 @@ class PolicyWindows:
             state = begun.state.clone()
             state[begun.network, begun.place] = last
         now = begun._replace(state=state, latent=table.latent[rows])
-        return History(*table.history[rows].unbind(1)), now
+        return dict(zip(OBSERVED, table.history[rows].unbind(1), strict=True)), now
