@@ -190,6 +190,10 @@ from .policies.heads.stochastic import NOISE_SCALE as NOISE_SCALE, StochasticHea
 from .policies.history import History as History, measured_history as measured_history
 from .policies.inputs import require_no_further_signals as require_no_further_signals
 from .policies.inputs.base import PolicyInput as PolicyInput
+from .policies.known_drivers import (
+    base_of as base_of,
+    driver_features_of as driver_features_of,
+)
 from .policies.ready import READY_FOLDER as READY_FOLDER
 from .policies.valid_range import (
     FADED as FADED,

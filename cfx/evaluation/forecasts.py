@@ -203,7 +203,7 @@ def _chunks(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origin
     """Cuts origins into parts whose signals and states fit the memory."""
     frames = batch.mask.shape[1]
     per_origin = _COPIES * (len(RECORDED) + len(batch.surroundings) + 2) * frames
-    states = agent.network.initial_state(len(agent.names), 1)
+    states = agent.core.network.initial_state(len(agent.names), 1)
     per_origin += _COPIES * math.prod(states.shape[2:])
     size = max(1, _CHUNK_BYTES // (8 * per_origin))
     for first in range(0, len(origins), size):

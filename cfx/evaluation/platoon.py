@@ -196,8 +196,8 @@ def _grouped(model: DrivingModel, agents: Sequence[Agent]) -> list[list[Agent]]:
     """Returns the agents in order, those behind one another together that drive the same model."""
     groups: list[list[Agent]] = []
     for agent in agents:
-        is_alone = agent.head.driven_model(model) is not model
-        if is_alone or not groups or groups[-1][-1].head.driven_model(model) is not model:
+        is_alone = agent.core.head.driven_model(model) is not model
+        if is_alone or not groups or groups[-1][-1].core.head.driven_model(model) is not model:
             groups.append([])
         groups[-1].append(agent)
     return groups
@@ -225,7 +225,7 @@ def simulate_platoons(
         For each agent the speeds of its N platoons `(V + 1, N, T)`, vehicle 0 being the leader, and
         the gaps of the followers `(V, N, T)`.
     """
-    dt, windows, device = agents[0].dt, agents[0].windows, agents[0].scaler.mean.device
+    dt, windows, device = agents[0].dt, agents[0].windows, agents[0].core.scaler.mean.device
     bounds = np.cumsum([0] + [len(agent.names) for agent in agents]).tolist()
     parts = [slice(first, last) for first, last in pairwise(bounds)]
     road = _Road(torch.as_tensor(manoeuvre.speed(dt), device=device), bounds[-1], dt)

@@ -116,7 +116,7 @@ class _Description(BaseModel):
             policy=dict(agent.policy_node),
             model=dict(agent.model_node),
             parameters=agent.space.names,
-            head=agent.head.name,
+            head=agent.core.head.name,
             windows=agent.windows,
             dt=agent.dt,
             names=agent.names,
@@ -197,9 +197,9 @@ def _agent(
 
 def _tensors(agent: Agent) -> dict[str, Tensor]:
     tensors = {}
-    for name, value in agent.network.state_dict().items():
+    for name, value in agent.core.network.state_dict().items():
         tensors[f"network.{name}"] = value.cpu()
-    for name, value in agent.scaler.state_dict().items():
+    for name, value in agent.core.scaler.state_dict().items():
         tensors[f"scaler.{name}"] = value.cpu()
     for name in ("base", "population", "dispersion"):
         value = getattr(agent, name)

@@ -116,9 +116,9 @@ class DriverStep:
                 " so that nothing else can drive it; give a policy of a model that cfx has, such as"
                 " krauss or idm"
             )
-        self.model = self.agent.head.driven_model(model)
+        self.model = self.agent.core.head.driven_model(model)
         self.dt = self.agent.dt
-        self.noise_width = self.agent.head.noise_width
+        self.noise_width = self.agent.core.head.noise_width
         self.further_signals = self.agent.core.further_signals
         self.signals = (*OBSERVED, *(signal.name for signal in self.further_signals))
         self._begun = self.agent.begin(torch.zeros(1, dtype=torch.int64), context)
@@ -237,7 +237,7 @@ class DriverStep:
         """Returns the state of drivers whose window begins with their new parameters."""
         begun, count = self._begun, state.steps.shape[0]  # `len` would export it as a constant
         base = None if begun.base is None else begun.base.expand(count, -1)
-        known = AgentState(
+        before = AgentState(
             begun.network.expand(count),
             torch.arange(count, device=begun.network.device),
             state.network[None],
@@ -248,7 +248,7 @@ class DriverStep:
             state.latent,
         )
         history = dict(zip(self.signals, state.history.unbind(1), strict=True))
-        chosen, after = self.agent.choose(history, known, noise)
+        chosen, after = self.agent.choose(history, before, noise)
         return state._replace(
             parameters=chosen, network=after.state[0], latent=after.latent, score=after.score
         )

@@ -217,7 +217,7 @@ def act(agent: Agent, state: AgentState, seed: int | None) -> tuple[Tensor, Agen
 
 def test_an_agent_draws_only_from_a_generator_and_the_same_from_the_same_seed() -> None:
     agent = adaptive(KRAUSS, stochastic=True)
-    assert agent.is_stochastic
+    assert agent.core.head.is_stochastic
     state = agent.begin(torch.zeros(3, dtype=torch.int64))
     centre, after = act(agent, state, None)
     assert torch.equal(act(agent, state, None)[0], centre)

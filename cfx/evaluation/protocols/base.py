@@ -199,7 +199,7 @@ class ProtocolContext:
             scopes,
             self.space,
             seed=self.seed,
-            policy_space=policy.model_space,
+            policy_space=policy.core.head.model_space,
             metrics=self.metrics,
         )
         return replace(evaluation, platoon=platoon, outside=outside_of_scopes(policy, scopes))

@@ -47,6 +47,11 @@ class ParameterHead(ABC):
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:
         """Returns the head for a driving model's parameters: it chooses the parameter space."""
 
+    @property
+    def is_stochastic(self) -> bool:
+        """Whether it draws random numbers."""
+        return self.noise_width > 0
+
     def to(self, device: torch.device | str) -> Self:
         """Returns the same head for tensors of a device."""
         return type(self)(self.space, device)

@@ -394,11 +394,12 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
 
     from cfx.data.tidy import frame_of
     from cfx.policies import checkpoint
+    from cfx.policies.prediction import predict_frame
 
     first = replace(pairs[0].beginning(_EXAMPLE_FRAMES), truth={}, truth_model="")
     frame = frame_of(PairSet((first,), pairs.source))
     try:
-        answer = checkpoint.load_agent(folder).predict_frame(frame)
+        answer = predict_frame(checkpoint.load_agent(folder), frame)
     except CfxError as error:
         log.info("The policy has no input example in MLflow: %s", error)
         return {}

@@ -268,7 +268,9 @@ def test_with_a_residual_a_forecast_starts_with_the_drivers_acceleration(residua
     model = IDM()
     agent = agent_of(UkfPolicy(), model, model.space.defaults()[None])
     head = head_class("direct_residual" if residual else "direct").for_model(model)
-    agent = replace(agent, core=AgentCore(agent.policy, agent.network, agent.scaler, head))
+    agent = replace(
+        agent, core=AgentCore(agent.core.policy, agent.core.network, agent.core.scaler, head)
+    )
     origins = Origins(torch.tensor([0, 1, 2]), torch.tensor([100, 120, 150]))
     paths = simulate_from_origins(
         MemoryStepper(model, 0.1), agent, Followers(batch, torch.zeros(3).long()), origins, 1
@@ -294,7 +296,7 @@ def test_an_estimator_is_saved_and_loaded(name: str, tmp_path: Path) -> None:
     head = head_class("direct_residual").for_model(Krauss())
     agent = replace(
         agent,
-        core=AgentCore(agent.policy, agent.network, agent.scaler, head),
+        core=AgentCore(agent.core.policy, agent.core.network, agent.core.scaler, head),
         policy_node={"name": name, **policy.settings.model_dump(), "residual": True},
     )
     checkpoint.save_agent(agent, tmp_path)

@@ -630,7 +630,7 @@ def test_the_package_gives_the_driver_and_imports_no_sumo() -> None:
 
 
 def _baseline(policy: Agent, component: Any, pairs: int) -> Agent:
-    space = policy.model_space
+    space = policy.core.head.model_space
     unit = space.to_unit(space.defaults()).expand(pairs, -1)
     blank = torch.zeros((pairs, 1)).double()
     names = tuple(str(i) for i in range(pairs))

@@ -77,7 +77,7 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
 )
 def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated(name: str, least: float) -> None:
     agent = cfx.load(f"cfx://{name}").policy
-    assert agent.is_stochastic
+    assert agent.core.head.is_stochastic
     frames = torch.full((2, agent.windows.length), 10.0, dtype=torch.float64)
     history = observed(frames, frames * 0, frames, frames * 0, frames * 2)
 
@@ -158,7 +158,7 @@ def test_a_policy_that_answers_what_its_model_does_not_use_is_tested_all_the_sam
     )
     protocol = make_protocol(config)
     model = Parts.of(complete(config, protocol), protocol).model
-    assert model.space.names == cfx.load("cfx://i80-w99").policy.model_space.names
+    assert model.space.names == cfx.load("cfx://i80-w99").policy.core.head.model_space.names
     assert "cc9" in model.space.names
 
 

@@ -46,7 +46,7 @@ class _Step(nn.Module):
     def __init__(self, step: DriverStep) -> None:
         super().__init__()
         self.step = step
-        self.network = step.agent.network  # so that its weights are the graph's
+        self.network = step.agent.core.network  # so that its weights are the graph's
         self.kept = kept_of(step)
 
     def forward(self, signals: tuple[Tensor, ...], more: tuple[Tensor, ...]) -> tuple[Tensor, ...]:

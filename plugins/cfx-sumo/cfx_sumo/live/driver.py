@@ -157,7 +157,7 @@ class Driver:
         check_model(self.model, policy.model_node["name"], source)
         self.counts = DriveCounts()
         self._assignments = Assignments(policy, network, source)
-        self._vehicles = KnownVehicles(policy, policy.head.driven_model(self.model))
+        self._vehicles = KnownVehicles(policy, policy.core.head.driven_model(self.model))
         self._histories = Histories(self._vehicles)
         self._windows = PolicyWindows(policy, self._vehicles, self._assignments, seed)
         self._model_steps = ModelSteps(
@@ -248,8 +248,9 @@ class Driver:
                     themselves
                 ignore it.
             driver_features: name -> value, where the policy was trained to read some
-                (`policy.driver_features`; `Agent.driver_features_of` measures them); None: those of
-                an unseen driver. What a vehicle does while it is watched does not change them.
+                (`policy.driver_features`; `cfx.plugin.driver_features_of` measures them); None:
+                those of an unseen driver. What a vehicle does while it is watched does not change
+                them.
 
         Raises:
             DataError: the policy has no such network.

@@ -35,7 +35,7 @@ class PolicyWindows:
         self._policy = policy
         self._vehicles = vehicles
         self._assignments = assignments
-        self._seed = seed if policy.is_stochastic else None
+        self._seed = seed if policy.core.head.is_stochastic else None
 
     def begin(self, rows: Tensor, names: list[str]) -> None:
         """Begins vehicles behind a leader anew, with what is known of them from elsewhere.
@@ -93,7 +93,7 @@ class PolicyWindows:
             noise = None
             if self._seed is not None:
                 drawn = [names[number] for number in block.tolist()]
-                noise = standard_normal(self._seed, drawn, now, self._policy.head.noise_width)
+                noise = standard_normal(self._seed, drawn, now, self._policy.core.head.noise_width)
             self._choose_together(rows[block], noise)
 
     def observe(self, rows: Tensor, clock: Clock) -> None:
