@@ -145,8 +145,10 @@ def best_average(speed: Floats, acceleration: Floats, dt: float) -> Average:
         return error, Average(constant, factor)
 
     recorded, _ = judged(0.0)
-    error, best = min(judged(constant) for constant in TIME_CONSTANTS_S)
-    return best if error < _WORTH * recorded else RECORDED
+    error, best = min([judged(constant) for constant in TIME_CONSTANTS_S])
+    if error < _WORTH * recorded:
+        return best
+    return RECORDED
 
 
 def smoothed_twice(values: Floats, constant: float, dt: float) -> Floats:

@@ -64,7 +64,7 @@ class FileStart(NamedTuple):
                 return ()
         if not self.lines:
             return ()
-        return tuple(cell.strip().strip('"') for cell in re.split("[,;]", self.lines[0]))
+        return tuple([cell.strip().strip('"') for cell in re.split("[,;]", self.lines[0])])
 
     def has_columns(self, *names: str) -> bool:
         """Says whether the first line has all these cells."""
@@ -90,6 +90,11 @@ def beginning(path: Path) -> FileStart:
     if "\0" in text:
         text = ""
     return FileStart(path, start, tuple(text.splitlines()[:20]))
+
+
+def has_letters(text: str) -> bool:
+    """Says whether a text has a letter, as names of columns have and numbers have not."""
+    return any(character.isalpha() for character in text)
 
 
 def stem(path: Path) -> str:

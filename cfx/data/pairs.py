@@ -9,6 +9,7 @@ Shapes: P pairs, T frames of the longest pair.
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -31,14 +32,15 @@ Array = NDArray[np.float64]
 _LIKENESS_FRAMES = 8
 """Frames of a pair at which its likeness is taken."""
 
-_ALIKE = 0.1 + 1e-9
+_TOLERANCE = 0.1 + 1e-9
 """m/s and m; the same trajectory saved with one decimal differs by less, two drivers by more."""
 
-_LIVELY_MPS, _TELLING_FRAMES = 1.0, 40
-"""m/s, frames: drivers may be alike whose speeds differ by less, or of whom less is known."""
+_MIN_SPEED_RANGE_MPS, _MIN_FRAMES = 1.0, 40
+"""Two recordings are compared only if the speed varies by at least this much over at least this
+many frames. Shorter or steadier ones look alike by chance."""
 
-_TOGETHER = 1024
-"""Pairs that one part of the work reads before their signals are let go of."""
+_PAIRS_AT_ONCE = 1024
+"""Pairs that are read before the memory of their signals is released, which may lie in files."""
 
 
 @dataclass(frozen=True)
@@ -129,9 +131,11 @@ class Pair:
         A vehicle that keeps its name over recordings is one driver with adaptive cruise control and
         another one without.
         """
-        if self.vehicle:
-            return f"{self.vehicle} ({self.driver_type})" if self.driver_type else self.vehicle
-        return f"{self.recording}/{self.follower_id}"
+        if not self.vehicle:
+            return f"{self.recording}/{self.follower_id}"
+        if not self.driver_type:
+            return self.vehicle
+        return f"{self.vehicle} ({self.driver_type})"
 
     @property
     def gap(self) -> Array:
@@ -155,10 +159,12 @@ class Pair:
         In plain numbers: frames, time step (ms), then at frames evenly spread over the pair both
         speeds (m/s) and the gap (m); see `LearnedFrom`.
         """
-        at = np.linspace(0, len(self) - 1, _LIKENESS_FRAMES).round().astype(np.int64)
-        values = (self.leader_speed[at], self.follower_speed[at], self.gap[at])
-        numbers = [f"{value:.2f}" for value in np.concatenate(values)]
-        return " ".join([str(len(self)), f"{1000 * self.dt:.0f}", *numbers])
+        frames = np.linspace(0, len(self) - 1, _LIKENESS_FRAMES).round().astype(np.int64)
+        values = (self.leader_speed[frames], self.follower_speed[frames], self.gap[frames])
+        words = [str(len(self)), f"{1000 * self.dt:.0f}"]
+        for value in np.concatenate(values):
+            words.append(f"{value:.2f}")
+        return " ".join(words)
 
     def _digest(self, header: str) -> str:
         digest = hashlib.sha256(header.encode())
@@ -182,19 +188,34 @@ class LearnedFrom:
     """
 
     def __init__(self, likenesses: Iterable[str]) -> None:
-        found: dict[str, list[Array]] = {}
-        for one in likenesses:
-            length, numbers = _numbers(one)
-            found.setdefault(length, []).append(numbers)
-        self._known = {length: np.array(numbers) for length, numbers in found.items()}
+        rows: dict[str, list[Array]] = {}
+        for likeness in likenesses:
+            length, numbers = _parsed(likeness)
+            rows.setdefault(length, []).append(numbers)
+        self._by_length: dict[str, Array] = {}
+        for length, same_length in rows.items():
+            self._by_length[length] = np.array(same_length)
 
     def __contains__(self, pair: Pair) -> bool:
-        length, numbers = _numbers(pair.likeness)
-        known = self._known.get(length)
-        return known is not None and bool((np.abs(known - numbers) <= _ALIKE).all(1).any())
+        length, numbers = _parsed(pair.likeness)
+        candidates = self._by_length.get(length)
+        if candidates is None:
+            return False
+        agrees = np.abs(candidates - numbers) <= _TOLERANCE
+        return bool(agrees.all(1).any())
 
 
-def _numbers(likeness: str) -> tuple[str, Array]:
+def driver_names(pairs: Iterable[Pair]) -> set[str]:
+    """Returns the names of the followers' drivers."""
+    return {pair.driver for pair in pairs}
+
+
+def over_frames(pairs: Iterable[Pair], name: str) -> Array:
+    """Returns a signal, or the gap, over the frames of all pairs, one pair after the other."""
+    return np.concatenate([getattr(pair, name) for pair in pairs])
+
+
+def _parsed(likeness: str) -> tuple[str, Array]:
     """Returns a likeness's frames and time step, and its speeds and gaps, `(24,)`."""
     frames, step, *numbers = likeness.split()
     return f"{frames} {step}", np.array(numbers, dtype=np.float64)
@@ -206,25 +227,45 @@ def twins(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
     Pairs whose speed hardly changes, and short ones, are none: many may drive so.
     """
     by_length: dict[str, list[tuple[int, Array]]] = {}
-    for at, pair in enumerate(pairs):
-        length, numbers = _numbers(pair.likeness)
+    for place, pair in enumerate(pairs):
+        length, numbers = _parsed(pair.likeness)
         speeds = numbers[_LIKENESS_FRAMES : 2 * _LIKENESS_FRAMES]
-        if len(pair) >= _TELLING_FRAMES and np.ptp(speeds) > _LIVELY_MPS:
-            by_length.setdefault(length, []).append((at, numbers))
-    found = []
-    for same in by_length.values():
-        values = np.array([numbers for _, numbers in same])
-        order = np.argsort(values.sum(1))
-        values, total = values[order], values.sum(1)[order]
-        for further in range(1, len(same)):
-            near = total[further:] - total[:-further] <= _ALIKE * values.shape[1]
-            if not near.any():
-                break
-            (first,) = np.nonzero(near)
-            alike = np.abs(values[first] - values[first + further]).max(1) <= _ALIKE
-            for one in first[alike].tolist():
-                found.append(sorted(same[order[k]][0] for k in (one, one + further)))
-    return [(pairs[one].pair_id, pairs[other].pair_id) for one, other in sorted(found)]
+        if len(pair) >= _MIN_FRAMES and np.ptp(speeds) > _MIN_SPEED_RANGE_MPS:
+            by_length.setdefault(length, []).append((place, numbers))
+    places: list[tuple[int, int]] = []
+    for same_length in by_length.values():
+        own_places = np.array([place for place, _ in same_length])
+        places += _places_alike(own_places, np.array([numbers for _, numbers in same_length]))
+    ids = []
+    for earlier, later in sorted(places):
+        ids.append((pairs[earlier].pair_id, pairs[later].pair_id))
+    return ids
+
+
+def _places_alike(places: NDArray[np.int64], values: Array) -> list[tuple[int, int]]:
+    """Returns the places of any two pairs of one length that agree, the earlier one first.
+
+    The sums of two pairs that agree differ by no more than the tolerance times the numbers that are
+    compared. So pairs are sorted by their sums, and each is compared with its neighbours alone,
+    until even the nearest are too far apart.
+
+    Args:
+        places: of P pairs, `(P,)`.
+        values: their speeds and gaps, `(P, 24)`.
+    """
+    order = np.argsort(values.sum(1))
+    places, values, sums = places[order], values[order], values.sum(1)[order]
+    alike = []
+    for distance in range(1, len(values)):
+        is_near = sums[distance:] - sums[:-distance] <= _TOLERANCE * values.shape[1]
+        if not is_near.any():
+            break
+        (first,) = np.nonzero(is_near)
+        differences = np.abs(values[first] - values[first + distance]).max(1)
+        for row in first[differences <= _TOLERANCE].tolist():
+            earlier, later = sorted((int(places[row]), int(places[row + distance])))
+            alike.append((earlier, later))
+    return alike
 
 
 @dataclass(frozen=True)
@@ -283,9 +324,14 @@ class PairSet(Sequence[Pair]):
         return self.pairs[index]
 
     def __iter__(self) -> Iterator[Pair]:
-        for start in range(0, len(self.pairs), _TOGETHER):
-            yield from self.pairs[start : start + _TOGETHER]
+        for start in range(0, len(self.pairs), _PAIRS_AT_ONCE):
+            yield from self.pairs[start : start + _PAIRS_AT_ONCE]
             memory.release()
+
+    @property
+    def frames(self) -> int:
+        """The number of frames of all pairs."""
+        return sum(len(pair) for pair in self.pairs)
 
     @property
     def size(self) -> int:
@@ -300,14 +346,16 @@ class PairSet(Sequence[Pair]):
         """
         is_large = self.size >= memory.LARGE
         changed: list[Pair] = []
-        for start in range(0, len(self.pairs), _TOGETHER):
-            part = []
-            for pair in self.pairs[start : start + _TOGETHER]:
-                made = change(pair)
-                if made is not None:
-                    part.append(made)
-            some = replace(self, pairs=tuple(part))
-            changed += some.in_file() if is_large else some
+        for start in range(0, len(self.pairs), _PAIRS_AT_ONCE):
+            changed_pairs = []
+            for pair in self.pairs[start : start + _PAIRS_AT_ONCE]:
+                changed_pair = change(pair)
+                if changed_pair is not None:
+                    changed_pairs.append(changed_pair)
+            part = replace(self, pairs=tuple(changed_pairs))
+            if is_large:
+                part = part.in_file()
+            changed += part
             memory.release()
         return replace(self, pairs=tuple(changed))
 
@@ -338,14 +386,15 @@ class PairSet(Sequence[Pair]):
 
     def take(self, numbers: Sequence[int]) -> PairSet:
         """Returns the pairs at these places; nothing is counted as left out."""
-        return replace(self, pairs=tuple(self.pairs[number] for number in numbers))
+        return replace(self, pairs=tuple([self.pairs[number] for number in numbers]))
 
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:
         """Keeps the pairs marked True and counts the others under `reason`."""
-        kept = tuple(pair for pair, wanted in zip(self.pairs, keep, strict=True) if wanted)
-        lost = len(self.pairs) - len(kept)
-        dropped = (Dropped(reason, lost),) if lost else ()
-        return replace(self, pairs=kept, dropped=(*self.dropped, *dropped))
+        kept = tuple(itertools.compress(self.pairs, keep))
+        dropped = self.dropped
+        if len(kept) < len(self.pairs):
+            dropped = (*dropped, Dropped(reason, len(self.pairs) - len(kept)))
+        return replace(self, pairs=kept, dropped=dropped)
 
     @property
     def dt(self) -> float:
@@ -356,9 +405,9 @@ class PairSet(Sequence[Pair]):
         """
         steps = sorted({round(pair.dt, 9) for pair in self.pairs})
         if len(steps) != 1:
-            listed = ", ".join(f"{step:g} s" for step in steps)
+            in_words = ", ".join([f"{step:g} s" for step in steps])
             raise DataError(
-                f"{self.source}: the pairs have different time steps ({listed}); a job needs one:"
+                f"{self.source}: the pairs have different time steps ({in_words}); a job needs one:"
                 " bring them to one with data.time_step, or split the file"
             )
         return steps[0]
@@ -445,25 +494,26 @@ class PairBatch:
 
         if not len(pairs):
             raise DataError("no pairs to stack")
-        pair_set = pairs if isinstance(pairs, PairSet) else PairSet(tuple(pairs), "pairs")
-        dt, dtype = pair_set.dt, dtype or torch.float64
-        length = max(frames, *(len(pair) for pair in pair_set.pairs))
-        shape = (len(pair_set), length)
+        if not isinstance(pairs, PairSet):
+            pairs = PairSet(tuple(pairs), "pairs")
+        dt, dtype = pairs.dt, dtype or torch.float64
+        length = max(frames, *(len(pair) for pair in pairs.pairs))
+        shape = (len(pairs), length)
         signals = {}
         for name in RECORDED:
             # Filled row by row: a list of rows would hold the signal twice.
             values = memory.empty(shape, together=len(RECORDED))
-            for row, pair in zip(values, pair_set, strict=True):
+            for row, pair in zip(values, pairs, strict=True):
                 row[:] = _extend(pair, name, length)
             signals[name] = torch.as_tensor(values).to(device=device, dtype=dtype)
         surroundings = {}
-        for signal in pair_set.surroundings:
-            values = memory.empty(shape, together=len(pair_set.surroundings))
-            for row, pair in zip(values, pair_set, strict=True):
+        for signal in pairs.surroundings:
+            values = memory.empty(shape, together=len(pairs.surroundings))
+            for row, pair in zip(values, pairs, strict=True):
                 row[:] = _extended_surroundings(pair, signal, length)
             surroundings[signal] = torch.as_tensor(values).to(device=device, dtype=dtype)
-        leader_lengths = [pair.leader_length for pair in pair_set.pairs]
-        lengths = torch.tensor([len(pair) for pair in pair_set.pairs])
+        leader_lengths = [pair.leader_length for pair in pairs.pairs]
+        lengths = torch.tensor([len(pair) for pair in pairs.pairs])
         mask = torch.as_tensor(memory.empty(shape, bool))
         torch.lt(torch.arange(length), lengths[:, None], out=mask)
         return cls(
@@ -582,7 +632,9 @@ def _extend(pair: Pair, name: str, length: int) -> Array:
         tail = values[-1] + speed * pair.dt * np.arange(1, missing + 1)
         origin = float(pair.follower_position[0])
     else:
-        last = values[-1] if name.endswith("speed") else 0.0
+        last = 0.0  # an acceleration
+        if name.endswith("speed"):
+            last = values[-1]
         tail = np.full(missing, last)
         origin = 0.0
     extended: Array = np.concatenate([values, tail]) - origin

@@ -30,8 +30,10 @@ def resampled(pairs: PairSet, step: float) -> PairSet:
     """
     kept = pairs.changed(lambda pair: _pair(pair, step))
     lost = len(pairs) - len(kept)
-    dropped = (Dropped(f"shorter than two steps of {step:g} s", lost),) if lost else ()
-    return replace(kept, dropped=(*pairs.dropped, *dropped))
+    if not lost:
+        return kept
+    dropped = Dropped(f"shorter than two steps of {step:g} s", lost)
+    return replace(kept, dropped=(*pairs.dropped, dropped))
 
 
 def frames_in_steps(frames: int, dt: float, step: float) -> int:
@@ -50,13 +52,14 @@ def _pair(pair: Pair, step: float) -> Pair | None:
         return pair
     from scipy.interpolate import PchipInterpolator
 
-    last = len(pair) - 1
     frames = frames_in_steps(len(pair), pair.dt, step)
-    at = np.arange(frames) * (step / pair.dt)  # in recorded frames
-    if len(at) < 2:
+    if frames < 2:
         return None
-    at = at.clip(max=last)
-    recorded = [np.asarray(getattr(pair, name), dtype=np.float64) for name in RECORDED]
+    at = np.arange(frames) * (step / pair.dt)  # in recorded frames
+    at = at.clip(max=len(pair) - 1)  # the last one may lie behind the recording by rounding
+    recorded = []
+    for name in RECORDED:
+        recorded.append(np.asarray(getattr(pair, name), dtype=np.float64))
     for values in pair.surroundings.values():
         recorded.append(np.asarray(values, dtype=np.float64))
     # The interpolator divides by slopes; an infinite quotient of a slope near 0 makes the slope 0.

@@ -32,7 +32,7 @@ A length of 0 says that the leader's position is that of its rear bumper. See
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from fractions import Fraction
@@ -255,8 +255,12 @@ class TidySettings(FileDatasetSettings):
                     f" and {quantity}; name another one"
                 )
             seen[column.title] = quantity
-        gap = by_name[GAP].title
-        columns = [replace(one, unless=gap if one.unless else "") for one in by_name.values()]
+        columns = []
+        for column in by_name.values():
+            unless = ""
+            if column.unless:
+                unless = by_name[GAP].title
+            columns.append(replace(column, unless=unless))
         return replace(LAYOUT, columns=tuple(columns))
 
     def further_signals(self) -> tuple[Signal, ...]:
@@ -281,7 +285,9 @@ class TidySettings(FileDatasetSettings):
         """Returns a column with the name and the unit that the file has for it."""
         called = getattr(self.columns, name)
         if called is not None:
-            scale = factor(self.unit_of(name) or column.unit, column.unit) if column.unit else 1.0
+            scale = 1.0
+            if column.unit:
+                scale = factor(self.unit_of(name) or column.unit, column.unit)
             return replace(column, called=called, factor=scale, needed=True, unless="")
         unit = getattr(self.units, name, None)
         if unit is not None and factor(unit, column.unit) != 1.0:
@@ -315,14 +321,19 @@ class TidyDataset(Dataset):
     def recognises(cls, start: FileStart) -> bool:
         if are_partitions(start.path):
             return True
-        known = {column.name for column in LAYOUT.columns if column.needed}
+        needed = set()
+        for column in LAYOUT.columns:
+            if column.needed:
+                needed.add(column.name)
         if start.magic == PARQUET and not start.columns:
             return True  # a damaged one: the reader says so
-        return len(known & set(start.columns)) >= 3
+        return len(needed & set(start.columns)) >= 3
 
     def contents(self) -> Contents:
-        own = self.settings.columns.gap or GAP
-        has_gaps = all(own in beginning(file).columns for file in self._files())
+        gap = self.settings.columns.gap or GAP
+        has_gaps = True
+        for file in self._files():
+            has_gaps &= gap in beginning(file).columns
         return super().contents()._replace(has_gaps=has_gaps)
 
     def _files(self) -> list[Path]:
@@ -338,8 +349,12 @@ class TidyDataset(Dataset):
         return joined(read_tidy(file, layout, signals) for file in self._files())
 
     def units(self) -> Mapping[str, str]:
-        units = {name: self.settings.unit_of(name) for name in OwnUnits.model_fields}
-        return {name: unit for name, unit in units.items() if unit}
+        units = {}
+        for name in OwnUnits.model_fields:
+            unit = self.settings.unit_of(name)
+            if unit:
+                units[name] = unit
+        return units
 
 
 def read_tidy(path: Path, layout: Layout = LAYOUT, signals: Sequence[Signal] = ()) -> PairSet:
@@ -353,7 +368,9 @@ def read_tidy(path: Path, layout: Layout = LAYOUT, signals: Sequence[Signal] = (
         DataError: the file cannot be read or does not keep to the layout.
     """
     recording = recording_of(path)
-    given = {} if recording is None else {"recording": recording}
+    given = {}
+    if recording is not None:
+        given["recording"] = recording
     return _pairs(read_table(path, _with_signals(layout, signals), given), signals)
 
 
@@ -533,12 +550,13 @@ def _write(tables: Iterator[Any], temporary: Path, name: str) -> None:
 
 def _tables(pairs: PairSet) -> Iterator[Any]:
     """Yields pairs as Arrow tables in the tidy layout, some pairs after the other; one at least."""
-    optional = []
-    if any(pair.lane is not None for pair in pairs.pairs):
-        optional.append(LANE)
-    for name, attribute in OPTIONAL_LABELS.items():
-        if any(getattr(pair, attribute) for pair in pairs.pairs):
-            optional.append(name)
+    optional = set()
+    for pair in pairs.pairs:
+        if pair.lane is not None:
+            optional.add(LANE)
+        for name, attribute in OPTIONAL_LABELS.items():
+            if getattr(pair, attribute):
+                optional.add(name)
     truths, signals = _truth_names(pairs), pairs.surroundings
     for start in range(0, max(1, len(pairs)), _PAIRS_AT_ONCE):
         yield _as_table(pairs[start : start + _PAIRS_AT_ONCE], optional, truths, signals)
@@ -547,7 +565,7 @@ def _tables(pairs: PairSet) -> Iterator[Any]:
 
 def _as_table(
     pairs: Sequence[Pair],
-    optional: Sequence[str],
+    optional: Collection[str],
     truths: Sequence[str],
     signals: Sequence[Signal],
 ) -> Any:
@@ -558,9 +576,10 @@ def _as_table(
     def per_pair(values: Sequence[Any], kind: Any) -> Any:
         return pa.array(values, kind).take(pair_of_row)
 
-    frames = [pair.first_frame + np.arange(len(pair)) for pair in pairs]
-    times = []
-    for frame, pair in zip(frames, pairs, strict=True):
+    frames, times = [], []
+    for pair in pairs:
+        frame = pair.first_frame + np.arange(len(pair))
+        frames.append(frame)
         times.append(np.asarray(frame * pair.dt, np.float64))
 
     columns: dict[str, Any] = {}
