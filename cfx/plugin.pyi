@@ -70,12 +70,12 @@ from .data.tracks import (
     Tracks as Tracks,
     accelerations as accelerations,
     changes as changes,
-    counted as counted,
-    driven as driven,
+    count_reasons as count_reasons,
+    distance_driven as distance_driven,
     extract_pairs as extract_pairs,
-    first_of as first_of,
+    first_that_holds as first_that_holds,
     runs as runs,
-    summed as summed,
+    totals_by_reason as totals_by_reason,
     unique_name as unique_name,
 )
 from .data.tracks import (

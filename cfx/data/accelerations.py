@@ -99,15 +99,15 @@ def averaged(pairs: PairSet) -> tuple[PairSet, list[float]]:
     constants: list[float] = []
 
     def change(pair: Pair) -> Pair:
-        own = best_average(pair.follower_speed, pair.follower_acceleration, pair.dt)
-        ahead = best_average(pair.leader_speed, pair.leader_acceleration, pair.dt)
-        if own == ahead == RECORDED:
+        of_follower = best_average(pair.follower_speed, pair.follower_acceleration, pair.dt)
+        of_leader = best_average(pair.leader_speed, pair.leader_acceleration, pair.dt)
+        if of_follower == of_leader == RECORDED:
             return pair
-        constants.append(max(own.constant, ahead.constant))
+        constants.append(max(of_follower.constant, of_leader.constant))
         return replace(
             pair,
-            follower_acceleration=own.of(pair.follower_acceleration, pair.dt),
-            leader_acceleration=ahead.of(pair.leader_acceleration, pair.dt),
+            follower_acceleration=of_follower.of(pair.follower_acceleration, pair.dt),
+            leader_acceleration=of_leader.of(pair.leader_acceleration, pair.dt),
         )
 
     return pairs.changed(change), constants

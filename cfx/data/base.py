@@ -23,11 +23,11 @@ from cfx.data.accelerations import Accelerations, with_usable_accelerations
 from cfx.data.check import Check, check_pairs
 from cfx.data.files import FileStart, recording_of, stem
 from cfx.data.names import Name
-from cfx.data.pairs import Dropped, Pair, PairSet, Remark, driver_names
+from cfx.data.pairs import Dropped, Pair, PairSet, Remark, driver_names, of_each
 from cfx.data.resampling import resampled, scaled
 from cfx.data.signals import RECORDED
 from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
-from cfx.data.tracks import summed
+from cfx.data.tracks import totals_by_reason
 from cfx.errors import DataError, PluginError, listed, nearest
 
 log = logging.getLogger(__name__)
@@ -351,8 +351,8 @@ def joined(files: Iterable[PairSet]) -> PairSet:
     return PairSet(
         tuple(pairs),
         f"{len(parts)} files ({sources})",
-        summed(dropped),
-        summed(ends),
+        totals_by_reason(dropped),
+        totals_by_reason(ends),
         tuple(remarks),
     )
 
@@ -421,7 +421,7 @@ def _selected(pairs: PairSet, name: str, setting: Any) -> PairSet:
     if setting is None:
         return pairs
     attribute = {"lanes": "lane", "pair_ids": "pair_id"}.get(name, name)
-    values = [getattr(pair, attribute) for pair in pairs]
+    values = of_each(pairs, attribute)
     recorded = list(dict.fromkeys(values))
     for blank in (None, ""):
         if blank in recorded:

@@ -21,7 +21,7 @@ from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset, rounded_down
 from cfx.data.check import Check, judge
 from cfx.data.files import Floats, Ints, beginning, has_letters, partitions
-from cfx.data.pairs import Dropped, Pair, PairSet, driver_names, over_frames
+from cfx.data.pairs import Dropped, Pair, PairSet, driver_names, of_each, over_frames
 from cfx.data.plausible import doubts, rare
 from cfx.data.resampling import frames_in_steps
 from cfx.data.style import (
@@ -283,10 +283,10 @@ def _describe_partitions(folder: Path, reader: _Reader) -> str:
     table.add_row("all", f"{len(names):,}", *_grouped_digits(totals))
     more, kept = _advice(lengths, dataset.settings.min_duration)
     layout = f"{dataset.layout}, {len(files)} files, read one after the other"
-    alone = "A recording alone: python -m cfx data describe FILE"
-    one = "One recording of it: data.recording=NAME"
+    one_file = "A recording alone: python -m cfx data describe FILE"
+    one_recording = "One recording of it: data.recording=NAME"
     use = reader.use(folder) + more
-    return _text([str(folder), "", layout, "", table, "", alone, use, *kept, one])
+    return _text([str(folder), "", layout, "", table, "", one_file, use, *kept, one_recording])
 
 
 def _grouped_digits(counts: Ints) -> list[str]:
@@ -457,7 +457,7 @@ def _quantities(pairs: PairSet) -> Iterator[tuple[str, Floats]]:
     yield "gap (bumper to bumper), m", gap
     yield "space headway (front to front), m", headway
     yield f"time headway (above {STANDING_MPS:g} m/s), s", headway[moving] / speed[moving]
-    yield "leader length, m", np.array([pair.leader_length for pair in pairs])
+    yield "leader length, m", np.array(of_each(pairs, "leader_length"))
 
 
 def _counts(counts: Sequence[Dropped]) -> list[str]:

@@ -169,13 +169,13 @@ def partitions(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         return [path]
-    found = sorted(_parquet_files(path))
-    if not found:
+    files = sorted(_parquet_files(path))
+    if not files:
         raise DataError(
             f"{path}: is a folder without parquet files; set data.path to a file, or to a folder"
             f" such as pairs with pairs/{_COLUMN}NAME/part-0.parquet in it"
         )
-    return found
+    return files
 
 
 def are_partitions(path: Path) -> bool:
@@ -219,11 +219,16 @@ def of_recording(files: Sequence[Path], recording: str | None) -> list[Path]:
     """
     if recording is None:
         return list(files)
-    wanted = [file for file in files if recording_of(file) in {None, recording}]
-    if not wanted:
-        known = sorted({recording_of(file) or "" for file in files})
+    chosen, recordings = [], set()
+    for file in files:
+        name = recording_of(file)
+        recordings.add(name or "")
+        if name is None or name == recording:
+            chosen.append(file)
+    if not chosen:
+        known = sorted(recordings)
         raise DataError(
             f"data.recording={recording}: there is no such recording.{nearest(recording, known)}"
             f" Known: {listed(known)}."
         )
-    return wanted
+    return chosen

@@ -210,9 +210,14 @@ def driver_names(pairs: Iterable[Pair]) -> set[str]:
     return {pair.driver for pair in pairs}
 
 
+def of_each(pairs: Iterable[Pair], name: str) -> list[Any]:
+    """Returns an attribute of each pair."""
+    return [getattr(pair, name) for pair in pairs]
+
+
 def over_frames(pairs: Iterable[Pair], name: str) -> Array:
     """Returns a signal, or the gap, over the frames of all pairs, one pair after the other."""
-    return np.concatenate([getattr(pair, name) for pair in pairs])
+    return np.concatenate(of_each(pairs, name))
 
 
 def _parsed(likeness: str) -> tuple[str, Array]:
@@ -512,7 +517,7 @@ class PairBatch:
             for row, pair in zip(values, pairs, strict=True):
                 row[:] = _extended_surroundings(pair, signal, length)
             surroundings[signal] = torch.as_tensor(values).to(device=device, dtype=dtype)
-        leader_lengths = [pair.leader_length for pair in pairs.pairs]
+        leader_lengths = of_each(pairs.pairs, "leader_length")
         lengths = torch.tensor([len(pair) for pair in pairs.pairs])
         mask = torch.as_tensor(memory.empty(shape, bool))
         torch.lt(torch.arange(length), lengths[:, None], out=mask)

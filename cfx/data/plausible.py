@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.data.pairs import Pair, PairSet, twins
+from cfx.data.pairs import Pair, PairSet, of_each, twins
 from cfx.data.style import STANDING_MPS
 from cfx.data.tracks import beyond_rates
 
@@ -37,7 +37,7 @@ def doubts(pairs: PairSet) -> Iterator[str]:
     for remark in pairs.remarks:
         if not remark.is_contradiction:
             yield remark.text
-    length = float(np.median([pair.leader_length for pair in pairs]))
+    length = float(np.median(of_each(pairs, "leader_length")))
     if length > _LONG_M:
         yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
     if len(pairs) >= _MANY:

@@ -25,7 +25,7 @@ from pydantic import Field, model_validator
 
 from cfx.core import memory
 from cfx.core.component import Settings
-from cfx.data.pairs import Pair, PairSet, over_frames
+from cfx.data.pairs import Pair, PairSet, of_each, over_frames
 from cfx.errors import DataError
 
 if TYPE_CHECKING:
@@ -226,7 +226,7 @@ def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
     import pandas as pd
 
     sizes = [len(pair) for pair in pairs]
-    code, drivers = pd.factorize(np.array([pair.driver for pair in pairs], dtype=object))
+    code, drivers = pd.factorize(np.array(of_each(pairs, "driver"), dtype=object))
     code = np.repeat(code, sizes)
     speed = over_frames(pairs, "follower_speed")
     acceleration = over_frames(pairs, "follower_acceleration")
@@ -437,8 +437,8 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
     weighted = scaled * np.array([style.weights[name] for name in names])
     score = style.table["score"].to_numpy(dtype=np.float64)
     rows: list[dict[str, object]] = []
-    for one, other in compared:
-        first, second = one.chosen & ~other.chosen, other.chosen & ~one.chosen
+    for group, other in compared:
+        first, second = group.chosen & ~other.chosen, other.chosen & ~group.chosen
         if min(first.sum(), second.sum()) < _FEWEST:
             continue
         tested = stats.permutation_test(
@@ -453,7 +453,7 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
             distance = stats.energy_distance(values[first], values[second])
             of_each[f"distance_{indicator.name}"] = float(distance)
         most = max(of_each, key=of_each.__getitem__).removeprefix("distance_")
-        row: dict[str, object] = {"site": one.site, "driver_type": one.driver_type}
+        row: dict[str, object] = {"site": group.site, "driver_type": group.driver_type}
         row |= {"other_site": other.site, "other_driver_type": other.driver_type}
         row |= {"distance": float(tested.statistic), "p_value": float(tested.pvalue), "most": most}
         rows.append(row | of_each)

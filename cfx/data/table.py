@@ -149,18 +149,18 @@ class Layout:
         for index, name in enumerate(names):
             at.setdefault(name, index)
             plain.setdefault(self.plain(name), index)
-        found: dict[str, _Found] = {}
+        matches: dict[str, _Found] = {}
         taken: set[int] = set()
         missing = []
         for column in self.columns:
-            matches = self._matches(column, at, plain)
-            for match in matches:
+            own_matches = self._matches(column, at, plain)
+            for match in own_matches:
                 if match.at not in taken:
-                    found[match.column.name] = match
-            taken.update(match.at for match in matches)
-            if not matches and column.needed and not (column.unless and column.unless in at):
+                    matches[match.column.name] = match
+            taken.update(match.at for match in own_matches)
+            if not own_matches and column.needed and not (column.unless and column.unless in at):
                 missing.append(column)
-        for match in found.values():
+        for match in matches.values():
             name = names[match.at]
             if names.count(name) > 1:
                 raise DataError(
@@ -168,7 +168,7 @@ class Layout:
                 )
         if missing:
             raise DataError(self._missing(source, missing, names))
-        return found
+        return matches
 
     def _matches(
         self, column: FileColumn, at: Mapping[str, int], plain: Mapping[str, int]
@@ -283,14 +283,14 @@ class Table:
         text = f"{self.source}, row {self.row(index)}"
         if column:
             text += f", column {self.title(column)}"
-        known = []
+        identity = []
         for word, key in self.layout.keys.items():
             if key in self.numbers:
-                known.append(f"{word} {self.numbers[key][index]:g}")
+                identity.append(f"{word} {self.numbers[key][index]:g}")
             elif self.labels[key].codes[index] >= 0:
-                known.append(f"{word} '{self.labels[key].at(int(index))}'")
-        if known:
-            text += f" ({', '.join(known)})"
+                identity.append(f"{word} '{self.labels[key].at(int(index))}'")
+        if identity:
+            text += f" ({', '.join(identity)})"
         return text
 
     def title(self, column: str) -> str:
@@ -344,9 +344,9 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
         more = dict(given or {})
         for name in stored:
             more.pop(name, None)
-        found = layout.found_in(str(path), [*stored, *more])
+        matches = layout.found_in(str(path), [*stored, *more])
         used = []
-        for match in found.values():
+        for match in matches.values():
             if match.at < len(stored):
                 used.append(stored[match.at])
         columns = file.read(columns=used)
@@ -356,7 +356,7 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
         raise DataError(
             f"{path}: the parquet file is cut off or damaged ({first_line(error)}); write it again"
         ) from None
-    return _checked(_Source(str(path), layout, [*stored, *more], 1), found, columns)
+    return _checked(_Source(str(path), layout, [*stored, *more], 1), matches, columns)
 
 
 def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
@@ -369,9 +369,9 @@ def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
         DataError: as `read_table`; or a column mixes numbers and text.
     """
     names = [str(name) for name in frame.columns]
-    found = layout.found_in(source, names)
-    used = frame.set_axis(names, axis=1)[[names[match.at] for match in found.values()]]
-    for match in found.values():
+    matches = layout.found_in(source, names)
+    used = frame.set_axis(names, axis=1)[[names[match.at] for match in matches.values()]]
+    for match in matches.values():
         name = names[match.at]
         # Names may be numbers in some rows and text in others; Arrow wants one type.
         if match.column.is_name and pd.api.types.infer_dtype(used[name]).startswith("mixed"):
@@ -383,7 +383,7 @@ def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
             f"{source}: a column mixes numbers and text ({first_line(error)});"
             " give each column one type"
         ) from None
-    return _checked(_Source(source, layout, names, 1), found, columns)
+    return _checked(_Source(source, layout, names, 1), matches, columns)
 
 
 # --- cells ----------------------------------------------------------------------------------------
@@ -398,13 +398,13 @@ class _Source(NamedTuple):
     first_row: int
 
 
-def _checked(source: _Source, found: Mapping[str, _Found], columns: Any) -> Table:
+def _checked(source: _Source, matches: Mapping[str, _Found], columns: Any) -> Table:
     """Returns Arrow columns as a table of numbers and names, in the layout's units."""
-    ignored = _ignored(source, found)
+    ignored = _ignored(source, matches)
     numbers: dict[str, Floats] = {}
     labels: dict[str, NameColumn] = {}
     table = Table(source.name, source.layout, numbers, labels, source.first_row, ignored)
-    for name, match in found.items():
+    for name, match in matches.items():
         cells = columns.column(source.columns[match.at])
         if match.column.is_name:
             labels[name] = _labels(table, name, cells)
@@ -413,19 +413,19 @@ def _checked(source: _Source, found: Mapping[str, _Found], columns: Any) -> Tabl
     if not len(table):
         raise DataError(f"{source.name}: has the right columns but no rows")
     for name, names in labels.items():
-        if not found[name].column.may_be_empty:
+        if not matches[name].column.may_be_empty:
             _require_names(table, name, names)
     for name, values in numbers.items():
-        _require_numbers(table, name, values, found[name].column)
-    for name, match in found.items():
+        _require_numbers(table, name, values, matches[name].column)
+    for name, match in matches.items():
         if match.column.factor != 1.0:
             numbers[name] = numbers[name] * match.column.factor
     return table
 
 
-def _ignored(source: _Source, found: Mapping[str, _Found]) -> list[str]:
+def _ignored(source: _Source, matches: Mapping[str, _Found]) -> list[str]:
     """Returns the names of columns that are not part of the layout."""
-    used = {match.at for match in found.values()}
+    used = {match.at for match in matches.values()}
     ignored = []
     for at, name in enumerate(source.columns):
         if at in used or name == _PANDAS_INDEX:
@@ -570,13 +570,13 @@ class _Text(NamedTuple):
 
 def _read_text(path: Path, layout: Layout) -> Table:
     text = _read_header(path, layout)
-    found = layout.found_in(str(path), text.names)
+    matches = layout.found_in(str(path), text.names)
     try:
-        columns = _parsed(text, found, pa.float64())
+        columns = _parsed(text, matches, pa.float64())
     except pa.ArrowInvalid:
         # Some cell is no plain number: read these columns as text and look closer.
-        columns = _parsed(text, found, pa.string())
-    return _checked(_Source(str(path), layout, text.names, text.skipped + 1), found, columns)
+        columns = _parsed(text, matches, pa.string())
+    return _checked(_Source(str(path), layout, text.names, text.skipped + 1), matches, columns)
 
 
 def _read_header(path: Path, layout: Layout) -> _Text:
@@ -651,7 +651,7 @@ def _decoded(path: Path, head: bytes) -> str:
     return text
 
 
-def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:
+def _parsed(text: _Text, matches: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:
     """Returns the columns found as one Arrow table.
 
     Args:
@@ -671,7 +671,7 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
     if text.delimiter == " ":
         parsed_by = ","  # `_Commas` puts them in place of white space
     types = {}
-    for match in found.values():
+    for match in matches.values():
         types[f"c{match.at}"] = number_type
         if match.column.is_name:
             types[f"c{match.at}"] = pa.dictionary(pa.int32(), pa.string())
@@ -702,7 +702,7 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
             row = broken[0]
             more = row.actual_columns - len(text.names)
             if spare == 0 and more == 1 and str(row.text).rstrip().endswith(parsed_by):
-                return _parsed(text, found, number_type, spare=1)
+                return _parsed(text, matches, number_type, spare=1)
             raise DataError(
                 f"{text.path}, row {row.number}: {row.actual_columns} columns instead of"
                 f" {width}; is the file cut off there, or does a cell hold a separator?"
@@ -717,7 +717,7 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
                     f"{text.path}, row {row + text.skipped + 1}: '{cell}' stands behind the"
                     f" last of {len(text.names)} columns; does a cell hold a separator?"
                 )
-    kept = {f"c{match.at}": text.names[match.at] for match in found.values()}
+    kept = {f"c{match.at}": text.names[match.at] for match in matches.values()}
     return table.select(list(kept)).rename_columns(list(kept.values()))
 
 

@@ -62,7 +62,7 @@ from cfx.data.files import (
     partitions,
     recording_of,
 )
-from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.pairs import Dropped, Pair, PairSet, of_each
 from cfx.data.signals import RECORDED, SIGNALS, Signal, declared_by, further_signals
 from cfx.data.table import FileColumn, Layout, Table, read_table, table_of
 from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, check_gap, time_steps
@@ -584,17 +584,17 @@ def _as_table(
 
     columns: dict[str, Any] = {}
     for name in LABELS:
-        columns[name] = per_pair([getattr(pair, name) for pair in pairs], pa.string())
+        columns[name] = per_pair(of_each(pairs, name), pa.string())
     columns["frame"] = pa.array(np.concatenate([np.zeros(0, np.int64), *frames]), pa.int64())
     columns["time_s"] = _over_time(times)
     for name in RECORDED:
-        columns[SIGNALS[name].column] = _over_time([getattr(pair, name) for pair in pairs])
-    columns[LENGTH] = per_pair([pair.leader_length for pair in pairs], pa.float64())
+        columns[SIGNALS[name].column] = _over_time(of_each(pairs, name))
+    columns[LENGTH] = per_pair(of_each(pairs, "leader_length"), pa.float64())
     if LANE in optional:
-        columns[LANE] = per_pair([pair.lane for pair in pairs], pa.int64())
+        columns[LANE] = per_pair(of_each(pairs, "lane"), pa.int64())
     for name, attribute in OPTIONAL_LABELS.items():
         if name in optional:
-            columns[name] = per_pair([getattr(pair, attribute) for pair in pairs], pa.string())
+            columns[name] = per_pair(of_each(pairs, attribute), pa.string())
     for name in truths:
         values = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
         columns[TRUE + name] = _over_time(values)

@@ -76,7 +76,9 @@ class AgentState(NamedTuple):
         state = self.state.new_zeros(shape)
         state[network, place] = self.state[network, self.place[drivers]]
         kept = {name: getattr(self, name)[drivers] for name in _OF_DRIVERS}
-        base = None if self.base is None else self.base[drivers]
+        base = self.base
+        if base is not None:
+            base = base[drivers]
         return AgentState(network=network, place=place, state=state, base=base, **kept)
 
 
@@ -308,7 +310,8 @@ class Agent:
         changed: dict[str, Any] = {}
         for name in ("base", "population", "dispersion"):
             value = getattr(self, name)
-            changed[name] = None if value is None else change(value)
+            if value is not None:
+                changed[name] = change(value)
         if self.valid_range is not None:
             changed["valid_range"] = ValidRange(*map(change, self.valid_range))
         return replace(self, **changed)

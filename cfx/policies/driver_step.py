@@ -122,7 +122,9 @@ class DriverStep:
         self.further_signals = self.agent.core.further_signals
         self.signals = (*OBSERVED, *(signal.name for signal in self.further_signals))
         self._begun = self.agent.begin(torch.zeros(1, dtype=torch.int64), context)
-        base = None if self._begun.base is None else self.agent.space.from_unit(self._begun.base)
+        base = self._begun.base
+        if base is not None:
+            base = self.agent.space.from_unit(base)
         self._free_parameters = self.agent.free_road_parameters(self._begun.network, base)
 
     def begin(self, drivers: int) -> DriverState:
@@ -175,7 +177,9 @@ class DriverStep:
         state = self._remembered(state, frame)
         due = self._is_due(state).nonzero().flatten()
         if len(due):
-            drawn = None if noise is None else noise[due]
+            drawn = noise
+            if drawn is not None:
+                drawn = drawn[due]
             state = state.with_drivers(due, self._chosen(state.of(due), drawn))
         return self._advanced(state, ego, leader, gap)
 
@@ -236,7 +240,9 @@ class DriverStep:
     def _chosen(self, state: DriverState, noise: Tensor | None) -> DriverState:
         """Returns the state of drivers whose window begins with their new parameters."""
         begun, count = self._begun, state.steps.shape[0]  # `len` would export it as a constant
-        base = None if begun.base is None else begun.base.expand(count, -1)
+        base = begun.base
+        if base is not None:
+            base = base.expand(count, -1)
         before = AgentState(
             begun.network.expand(count),
             torch.arange(count, device=begun.network.device),
@@ -312,6 +318,6 @@ def _on_free_road(state: DriverState) -> Tensor:
     return state.history[:, _GAP, -1] >= FREE_ROAD_M
 
 
-def _as_wide(drivers: Tensor, like: Tensor) -> Tensor:
+def _as_wide(drivers: Tensor, columns: Tensor) -> Tensor:
     """Returns a bool for each driver, `(D,)`, in as many dimensions as a tensor `(D, ...)`."""
-    return drivers.view(-1, *[1] * (like.dim() - 1))
+    return drivers.view(-1, *[1] * (columns.dim() - 1))

@@ -99,8 +99,8 @@ def token_width(inputs: Sequence[object], summary: Summary, length: int) -> int:
 def tokens(history: History, inputs: Sequence[PolicyInput], summary: Summary) -> Tensor:
     """Returns tokens `(*batch, f)` of recent frames `(*batch, length)`."""
     features = []
-    for one in inputs:
-        features += _summarised(one.values(history), summary)
+    for policy_input in inputs:
+        features += _summarised(policy_input.values(history), summary)
     return torch.stack(features, dim=-1)
 
 

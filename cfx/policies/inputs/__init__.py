@@ -60,8 +60,8 @@ def signals_beyond_recordings(inputs: Iterable[PolicyInput]) -> tuple[Signal, ..
         PluginError: two inputs declare a signal of one name or column in different ways.
     """
     signals: list[Signal] = []
-    for one in inputs:
-        signals += one.signals
+    for policy_input in inputs:
+        signals += policy_input.signals
     return further_signals(signals)
 
 
@@ -75,10 +75,11 @@ def require_no_further_signals(inputs: Iterable[PolicyInput], where: str) -> Non
     Raises:
         ConfigError: an input reads another signal.
     """
-    for one in inputs:
-        for signal in one.further_signals():
+    for policy_input in inputs:
+        for signal in policy_input.further_signals():
+            name = registry.name_of(policy_input)
             raise ConfigError(
-                f"the policy's input '{registry.name_of(one)}' reads the signal '{signal.name}'"
+                f"the policy's input '{name}' reads the signal '{signal.name}'"
                 f" ({signal.meaning}), which {where} does not give; use a policy that was trained"
                 " without this input"
             )
