@@ -92,7 +92,9 @@ class Pair:
     def __post_init__(self) -> None:
         for name in ("pair_id", "recording", "leader_id", "follower_id"):
             object.__setattr__(self, name, name_of(getattr(self, name)))
-        shapes = {name: getattr(self, name).shape for name in RECORDED}
+        shapes = {}
+        for name in RECORDED:
+            shapes[name] = getattr(self, name).shape
         for signal, values in self.surroundings.items():
             shapes[signal.name] = values.shape
         if len(set(shapes.values())) != 1 or len(shapes["leader_position"]) != 1:
@@ -117,12 +119,17 @@ class Pair:
 
     def beginning(self, frames: int) -> Pair:
         """Returns the pair over its first frames; all of it where it has no more."""
-        signals: dict[str, Any] = {name: getattr(self, name)[:frames] for name in RECORDED}
-        truth = {name: values[:frames] for name, values in self.truth.items()}
-        surroundings = {}
-        for signal, values in self.surroundings.items():
-            surroundings[signal] = values[:frames]
-        return replace(self, **signals, truth=truth, surroundings=surroundings)
+        return self.with_arrays(lambda values: values[:frames])
+
+    def with_arrays(self, change: Callable[[Array], Array]) -> Pair:
+        """Returns the pair with all that it has over time changed alike."""
+        changed: dict[str, Any] = {}
+        for name in RECORDED:
+            changed[name] = change(getattr(self, name))
+        for name in ("truth", "surroundings"):
+            arrays = getattr(self, name)
+            changed[name] = {key: change(values) for key, values in arrays.items()}
+        return replace(self, **changed)
 
     @property
     def driver(self) -> str:
@@ -239,8 +246,8 @@ def twins(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
             by_length.setdefault(length, []).append((place, numbers))
     places: list[tuple[int, int]] = []
     for same_length in by_length.values():
-        own_places = np.array([place for place, _ in same_length])
-        places += _places_alike(own_places, np.array([numbers for _, numbers in same_length]))
+        places_of_length, numbers_of_length = zip(*same_length, strict=True)
+        places += _places_alike(np.array(places_of_length), np.array(numbers_of_length))
     ids = []
     for earlier, later in sorted(places):
         ids.append((pairs[earlier].pair_id, pairs[later].pair_id))
@@ -341,7 +348,10 @@ class PairSet(Sequence[Pair]):
     @property
     def size(self) -> int:
         """Bytes of all signals."""
-        return 8 * sum(len(pair) * (len(RECORDED) + len(pair.surroundings)) for pair in self.pairs)
+        arrays = 0
+        for pair in self.pairs:
+            arrays += len(pair) * (len(RECORDED) + len(pair.surroundings))
+        return 8 * arrays
 
     def changed(self, change: Callable[[Pair], Pair | None]) -> PairSet:
         """Returns changed pairs, without those of which None is left.
@@ -374,7 +384,6 @@ class PairSet(Sequence[Pair]):
         for pair in self.pairs:
             size += len(pair) * (len(RECORDED) + len(pair.truth) + len(pair.surroundings))
         free = memory.in_file((size,))
-        stored = []
 
         def kept(array: Array) -> Array:
             nonlocal free
@@ -382,11 +391,9 @@ class PairSet(Sequence[Pair]):
             row[:] = array
             return row
 
+        stored = []
         for pair in self:
-            signals: dict[str, Any] = {name: kept(getattr(pair, name)) for name in RECORDED}
-            truth = {name: kept(array) for name, array in pair.truth.items()}
-            surroundings = {signal: kept(array) for signal, array in pair.surroundings.items()}
-            stored.append(replace(pair, **signals, truth=truth, surroundings=surroundings))
+            stored.append(pair.with_arrays(kept))
         return replace(self, pairs=tuple(stored))
 
     def take(self, numbers: Sequence[int]) -> PairSet:
@@ -429,7 +436,7 @@ class PairSet(Sequence[Pair]):
             signals = tuple(self.pairs[0].surroundings)
         for pair in self.pairs:
             if set(pair.surroundings) != set(signals):
-                expected = ", ".join(signal.name for signal in signals) or "none"
+                expected = ", ".join([signal.name for signal in signals]) or "none"
                 raise DataError(
                     f"{self.source}: pair {pair.pair_id} has other further signals than the first"
                     f" pair ({expected}); give every pair the same"
@@ -502,7 +509,8 @@ class PairBatch:
         if not isinstance(pairs, PairSet):
             pairs = PairSet(tuple(pairs), "pairs")
         dt, dtype = pairs.dt, dtype or torch.float64
-        length = max(frames, *(len(pair) for pair in pairs.pairs))
+        lengths = torch.tensor([len(pair) for pair in pairs.pairs])
+        length = max(frames, int(lengths.max()))
         shape = (len(pairs), length)
         signals = {}
         for name in RECORDED:
@@ -518,7 +526,6 @@ class PairBatch:
                 row[:] = _extended_surroundings(pair, signal, length)
             surroundings[signal] = torch.as_tensor(values).to(device=device, dtype=dtype)
         leader_lengths = of_each(pairs.pairs, "leader_length")
-        lengths = torch.tensor([len(pair) for pair in pairs.pairs])
         mask = torch.as_tensor(memory.empty(shape, bool))
         torch.lt(torch.arange(length), lengths[:, None], out=mask)
         return cls(
