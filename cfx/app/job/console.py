@@ -121,10 +121,9 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
     fitted = _fitted(evaluation) if scope == "test" else pd.DataFrame()
     for metric in shown:
         unit = f"\n[{metric.unit}]" if metric.unit else ""
-        # No word of a heading is cut where the table is narrow: headings wrap instead.
-        longest = max(len(word) for word in metric.heading.split())
-        heading = escape(f"{metric.heading}{unit}")
-        table.add_column(heading, justify="right", min_width=longest)
+        # A word a line: the table fits 80 columns, and no heading is cut.
+        heading = metric.heading.replace(" ", "\n")
+        table.add_column(escape(f"{heading}{unit}"), justify="right")
         if metric.name in fitted:
             table.add_column("where\nfitted", justify="right")
     baselines = result.baselines(scope) if with_improvement else ()

@@ -19,7 +19,8 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import RECORDED
 from cfx.data.tidy import write_tidy
 from cfx.errors import DataError
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
@@ -30,13 +31,14 @@ from cfx.models.krauss import Krauss
 from cfx.policies.base import Policy
 from cfx.policies.constant import DefaultPolicy, FixedPolicy
 from cfx.policies.core import Ensemble
-from cfx.policies.features import History
 from cfx.policies.gru import GruPolicy
+from cfx.policies.prediction import networks_for
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split, WindowSettings
 from cfx_contracts import protocols
 from tests.drives import straight_pairs, wavy_pairs
+from tests.histories import observed
 
 QUICK = [
     "debug=quick",
@@ -284,7 +286,7 @@ def test_trajectories_and_curves_are_kept(result: cfx.plugin.Result) -> None:
 def test_the_saved_policy_drives_unseen_drivers(result: cfx.plugin.Result) -> None:
     policy = cfx.load(result.folder).policy
     unseen = SyntheticDataset(pairs=2, frames=100, seed=9).load()
-    assert policy.networks_for(unseen).tolist() == [3, 3]
+    assert networks_for(policy, unseen).tolist() == [3, 3]
 
 
 def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_them() -> None:
@@ -298,7 +300,7 @@ def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_them() -> N
     first, second = before.evaluation.table, after.evaluation.table
     fold = int(first.fold.iloc[0])
     assert fold == int(second.fold.iloc[0])
-    one, two = before.policy.network.state_dict(), after.policy.network.state_dict()
+    one, two = before.policy.core.network.state_dict(), after.policy.core.network.state_dict()
     assert all(torch.equal(one[key][fold], two[key][fold]) for key in one)
     others = [k for k in range(3) if k != fold]
     assert all(any(not torch.equal(one[key][k], two[key][k]) for key in one) for k in others)
@@ -374,10 +376,12 @@ def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(
     assert again.base is not None
     assert torch.equal(again.base, learned.policy.base)  # type: ignore[arg-type]  # it has one
     assert again.context_rule.shrinkage == learned.policy.context_rule.shrinkage == 0.7
-    assert isinstance(again.network, Ensemble)
-    assert again.network.size == 2
-    kept = learned.policy.network.state_dict()
-    assert all(torch.equal(value, kept[key]) for key, value in again.network.state_dict().items())
+    assert isinstance(again.core.network, Ensemble)
+    assert again.core.network.size == 2
+    kept = learned.policy.core.network.state_dict()
+    assert all(
+        torch.equal(value, kept[key]) for key, value in again.core.network.state_dict().items()
+    )
     assert {
         "hard_braking/policy",
         "jerk/policy",
@@ -441,12 +445,12 @@ def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> No
     for policy in (result.policy, cfx.load(tmp_path / "one").policy):
         largest = float(Krauss().space["t_r"].high)
         assert policy.space["t_r"].high == 60 > largest
-        for weights in policy.network.parameters():
+        for weights in policy.core.network.parameters():
             weights.data.fill_(0.0)
-        policy.network.get_parameter("members.b_out").data.fill_(
+        policy.core.network.get_parameter("members.b_out").data.fill_(
             20.0
         )  # as large an answer as there is
-        silence = History(
+        silence = observed(
             *(torch.zeros((1, policy.windows.length), dtype=torch.float64) for _ in range(5))
         )
         anywhere = replace(policy, valid_range=None)  # it has learned nothing from silence
@@ -534,7 +538,7 @@ def test_trajectories_that_are_too_short_to_test_change_what_is_learned(tmp_path
     )
     cut = []
     for pair, count in zip(pairs, frames, strict=True):
-        signals: dict[str, Any] = {name: getattr(pair, name)[:count] for name in SIGNALS}
+        signals: dict[str, Any] = {name: getattr(pair, name)[:count] for name in RECORDED}
         cut.append(replace(pair, **signals))
     write_tidy(PairSet(tuple(cut), "test"), tmp_path / "pairs.csv")
     options = [

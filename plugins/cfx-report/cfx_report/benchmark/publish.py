@@ -252,7 +252,7 @@ def _base(agent: Agent) -> dict[str, float]:
     """Returns the driving model's base parameters, without those of a residual."""
     if agent.base is None:
         return {}
-    names = agent.model_space.names
+    names = agent.core.head.model_space.names
     return dict(zip(names, agent.base[0, : len(names)].tolist(), strict=True))
 
 
