@@ -44,7 +44,8 @@ from .data.files import (
 )
 from .data.pairs import Dropped as Dropped, Pair as Pair, PairBatch as PairBatch, PairSet as PairSet
 from .data.pairs import Remark as Remark
-from .data.signals import COARSE_S as COARSE_S
+from .data.resampling import COARSE_S as COARSE_S
+from .data.signals import OBSERVED as OBSERVED, SIGNALS as SIGNALS, Signal as Signal
 from .data.sites import with_sites as with_sites
 from .data.style import (
     ALL_TYPES as ALL_TYPES,
@@ -69,12 +70,12 @@ from .data.tracks import (
     Tracks as Tracks,
     accelerations as accelerations,
     changes as changes,
-    counted as counted,
-    driven as driven,
+    count_reasons as count_reasons,
+    distance_driven as distance_driven,
     extract_pairs as extract_pairs,
-    first_of as first_of,
+    first_that_holds as first_that_holds,
     runs as runs,
-    summed as summed,
+    totals_by_reason as totals_by_reason,
     unique_name as unique_name,
 )
 from .data.tracks import (
@@ -181,13 +182,18 @@ from .policies.driver_step import (
 )
 from .policies.driver_step import FREE_ROAD_M as FREE_ROAD_M
 from .policies.features import (
-    History as History,
     Scaler as Scaler,
     Summary as Summary,
-    measured_history as measured_history,
 )
 from .policies.heads.base import DirectHead as DirectHead, ParameterHead as ParameterHead
 from .policies.heads.stochastic import NOISE_SCALE as NOISE_SCALE, StochasticHead as StochasticHead
+from .policies.history import History as History, measured_history as measured_history
+from .policies.inputs import require_no_further_signals as require_no_further_signals
+from .policies.inputs.base import PolicyInput as PolicyInput
+from .policies.known_drivers import (
+    base_of as base_of,
+    driver_features_of as driver_features_of,
+)
 from .policies.ready import READY_FOLDER as READY_FOLDER
 from .policies.valid_range import (
     FADED as FADED,
@@ -219,8 +225,8 @@ from .evaluation.forecasts import (
 )
 from .evaluation.headline import (
     Comparison as Comparison,
-    contradiction as contradiction,
-    opposite as opposite,
+    doubts as doubts,
+    summaries_disagree as summaries_disagree,
 )
 from .evaluation.metrics.base import (
     Metric as Metric,
@@ -251,8 +257,9 @@ from .evaluation.result import (
 from .evaluation.sites import ALL_SITES as ALL_SITES
 from .evaluation.statistics import (
     Against as Against,
+    Ranking as Ranking,
     Improvement as Improvement,
-    against_the_best as against_the_best,
+    ranking_of as ranking_of,
     improvement_statistics as improvement_statistics,
     mean_interval as mean_interval,
     verdict as verdict,

@@ -39,7 +39,7 @@ class WindowInputs(NamedTuple):
     Attributes:
         features: of observed windows, normalised, `(B, N, D, F)`.
         present: 1 where a trajectory has that window, else 0, `(B, N, D)`.
-        leader: `(3, H, N, D, L + S)`.
+        leader: `(3 + E, H, N, D, L + S)`, as `RolloutInputs.leader`.
         leader_length: `(N, D)`.
         conditioning: `(N, D, c)`.
         base: `(N, D, n)`.
@@ -163,8 +163,8 @@ class ForwardPass:
         if window.temperature is not None:
             constant["temperature"] = window.temperature.expand(everywhere[:-1]).unsqueeze(-1)
         surroundings = {name: Operand(value) for name, value in constant.items()}
-        for name, signal in zip(MOTION, inputs.leader, strict=True):
-            surroundings[f"leader_{name}"] = Operand.over(signal.unsqueeze(2), -self.observed)
+        for name, signal in zip(window.leader_names, inputs.leader, strict=True):
+            surroundings[name] = Operand.over(signal.unsqueeze(2), -self.observed)
         surroundings["logits"] = self.in_driven(self.logits)
         return surroundings | self.columns(self.motion, -self.observed)
 

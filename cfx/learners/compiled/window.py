@@ -23,7 +23,7 @@ from cfx.learners.compiled.calls import Calls, Operand
 from cfx.learners.compiled.elementwise import Elementwise
 from cfx.learners.rollout import window
 from cfx.learners.rollout.window import LeaderWindow, LoopState, WindowStep
-from cfx.policies import features
+from cfx.policies import features, inputs
 from cfx.policies.features import token_width
 from cfx.policies.recurrent import RecurrentNetwork
 from cfx.simulation.kernel.columns import Unsupported
@@ -103,6 +103,8 @@ class CompiledWindow:
         features: what networks read, normalised, of motion and leaders.
         drive: the steps of the window, of the networks' answers, motion and leaders.
         cell: what a layer carries after the window, of the products with its weights.
+        leader_names: of what is recorded around the follower, in the order of
+            `RolloutInputs.leader`.
 
     Raises:
         Unsupported: networks are not recurrent, a function is not elementwise, or there is no
@@ -116,9 +118,11 @@ class CompiledWindow:
             raise Unsupported("networks that are not recurrent, or have dropout")
         self.step, self.network, self.temperature = step, network, temperature
         key, length = window_key(step), step.length
+        self.leader_names = [f"leader_{name}" for name in MOTION]
+        for signal in core.further_signals:
+            self.leader_names.append(f"around_{signal.name}")
         around = dict.fromkeys(MOTION, length)
-        for name in MOTION:
-            around[f"leader_{name}"] = length + step.stride
+        around |= dict.fromkeys(self.leader_names, length + step.stride)
         around["leader_length"] = 1
 
         width = core.scaler.mean.shape[-1]
@@ -144,7 +148,7 @@ class CompiledWindow:
 
     def _features(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
         """Returns normalised features."""
-        values = self.step.features(*_surroundings(given), given["conditioning"])
+        values = self.step.features(*self._surroundings(given), given["conditioning"])
         return [(values - given["mean"]) / given["scale"]]
 
     def _drive(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
@@ -155,11 +159,20 @@ class CompiledWindow:
             step = copy.copy(step)
             step.model = step.model.at_temperature(given["temperature"][..., 0])
         answer = (given["logits"] + given["bias"]).sigmoid()
-        after, speed, gap = step.steer(answer, *_surroundings(given), given["base"])
+        after, speed, gap = step.steer(answer, *self._surroundings(given), given["base"])
         moved = [after.position, after.speed, after.acceleration]
         if after.memory.shape[-1] > 0:
             moved.append(after.memory)
         return [*moved, speed, gap]
+
+    def _surroundings(self, given: Mapping[str, Tensor]) -> tuple[LoopState, LeaderWindow, Tensor]:
+        """Returns where trajectories stand, and the leaders around a window with their lengths."""
+        empty = given["position"][..., :0]
+        motion = (given["position"], given["speed"], given["acceleration"])
+        now = LoopState(*motion, given.get("memory", empty), empty, empty)
+        position, speed, acceleration, *more = [given[name] for name in self.leader_names]
+        leader = LeaderWindow(position, speed, acceleration, tuple(more))
+        return now, leader, given["leader_length"][..., 0]
 
     def _cell(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
         """Returns what a layer carries after a window; as before where there is no such window."""
@@ -167,15 +180,6 @@ class CompiledWindow:
         recurrent = given["recurrent"] + given["hidden_bias"]
         after = self.network.cell(projected, recurrent, given["carried"])
         return [torch.where(given["present"] > 0, after, given["carried"])]
-
-
-def _surroundings(given: Mapping[str, Tensor]) -> tuple[LoopState, LeaderWindow, Tensor]:
-    """Returns where trajectories stand, and the leaders around a window with their lengths."""
-    empty = given["position"][..., :0]
-    motion = (given["position"], given["speed"], given["acceleration"])
-    now = LoopState(*motion, given.get("memory", empty), empty, empty)
-    leader = LeaderWindow(*(given[f"leader_{name}"] for name in MOTION))
-    return now, leader, given["leader_length"][..., 0]
 
 
 def _part(key: object, *names: object) -> object:
@@ -188,11 +192,13 @@ def _part(key: object, *names: object) -> object:
 def window_key(step: WindowStep) -> object:
     """Returns what a window depends on besides tensors; None if only this process knows."""
     core, code = step.core, []
-    for component in (type(step.model), type(core.head), type(core.policy)):
-        code.append(component_code(component))
+    for component in (step.model, core.head, core.policy, *core.inputs):
+        code.append(component_code(type(component)))
     if None in code:
         return None
     settings = [step.model.equations_key(), repr(step.space), step.length, step.stride, step.dt]
-    read = [core.inputs, core.summary, core.scaler.mean.shape[-1]]
-    rooms = [folder_hash(module.__file__) for module in (features, parameters, losses, window)]
+    read = [core.policy.inputs, core.summary, core.scaler.mean.shape[-1]]
+    rooms = []
+    for module in (features, inputs, parameters, losses, window):
+        rooms.append(folder_hash(str(module.__file__)))
     return [code, settings, read, rooms, folder_hash(__file__)]

@@ -19,11 +19,11 @@ from cfx.plugin import (
     PairSet,
     Remark,
     accelerations,
-    counted,
-    driven,
-    first_of,
+    count_reasons,
+    distance_driven,
+    first_that_holds,
     runs,
-    summed,
+    totals_by_reason,
     unique_name,
 )
 
@@ -93,12 +93,14 @@ def pairs_of(
         labels = [values[good] for values in one.labels.values()]
         starts, sizes = runs(one.frame[good] - np.arange(len(good)), *labels)
         is_pair = sizes > 1
-        lost += counted({**reasons, SINGLE_FRAME: sizes < 2}, "rows")
+        lost += count_reasons({**reasons, SINGLE_FRAME: sizes < 2}, "rows")
         stops = starts + sizes
-        ends += counted(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
+        ends += count_reasons(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
         for start, stop in zip(starts[is_pair].tolist(), stops[is_pair].tolist(), strict=True):
             pairs.append(_pair(one, slice(good[start], good[stop - 1] + 1), seen))
-    return PairSet(tuple(pairs), source, summed(lost), summed(ends), tuple(remarks))
+    return PairSet(
+        tuple(pairs), source, totals_by_reason(lost), totals_by_reason(ends), tuple(remarks)
+    )
 
 
 def _left_out(one: Series, max_gap: float | None) -> dict[str, Marks]:
@@ -120,7 +122,7 @@ def _left_out(one: Series, max_gap: float | None) -> dict[str, Marks]:
         "the leader is behind its follower (gap of 0 or less)": gap <= 0,
         f"the leader is farther than {furthest:g} m": gap > furthest,
     }
-    return first_of(reasons)
+    return first_that_holds(reasons)
 
 
 def _ends(one: Series, reasons: Mapping[str, Marks], last: Ints) -> dict[str, Marks]:
@@ -136,7 +138,7 @@ def _ends(one: Series, reasons: Mapping[str, Marks], last: Ints) -> dict[str, Ma
         found[reason] = holds[after]
     for label, values in one.labels.items():
         found[f"the {label.replace('_', ' ')} changes"] = values[after] != values[last]
-    return first_of(found)
+    return first_that_holds(found)
 
 
 def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
@@ -147,7 +149,7 @@ def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
     if one.gap is not None:
         leader = signals.get("leader_position")
         if leader is None:
-            leader = driven(signals["leader_speed"], one.dt) + one.leader_length
+            leader = distance_driven(signals["leader_speed"], one.dt) + one.leader_length
         signals["leader_position"] = leader
         signals["follower_position"] = leader - one.leader_length - one.gap[run]
     for who in ("leader", "follower"):

@@ -28,7 +28,7 @@ from cfx.plugin import (
     Settings,
     Statement,
     Tracks,
-    counted,
+    count_reasons,
     extract_pairs,
     joined,
     remarks_of,
@@ -187,7 +187,7 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         driver_types=types,
         ids_are_unique=True,
         names=("", *names.tolist()),
-        dropped=(*rows.dropped, *counted(left_out, "rows")),
+        dropped=(*rows.dropped, *count_reasons(left_out, "rows")),
         remarks=remarks,
     )
     if gap is not None:
