@@ -111,7 +111,7 @@ def test_further_signals_are_compiled_too() -> None:
         data = training_data(networks=2)
         pairs = with_surroundings(wavy_pairs(Krauss(), TRUE, frames=260))
         built = module(replace(data, recorded=PairBatch.of(pairs)), policy, **SETTINGS)
-        assert built.training_window in built.scans
+        assert built.training_window in built.compiled
         eager, compiled = both(built, GradientPath(0.9, 1.0))
     for one, two in zip(eager, compiled, strict=True):
         torch.testing.assert_close(two, one, rtol=2e-3, atol=2e-3 * float(one.abs().max()))
