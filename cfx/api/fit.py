@@ -220,7 +220,7 @@ class Fit:
             agent = context.constant(FixedPolicy(), parameters)
             each = torch.arange(len(batch), device=batch.lengths.device)
             loop = simulate_in_shards(
-                context.engine, context.simulator, agent, Followers(batch, each), first
+                context.engine, context.stepper, agent, Followers(batch, each), first
             )
             speed, gap = closed_loop_errors(batch, first, loop)
             errors |= {"test_rmse_speed": speed, "test_rmse_gap": gap}
@@ -291,8 +291,8 @@ def calibrate(
         from cfx.app.job import steps
         from cfx.simulation.windows import Split
 
-        _, parts, context = steps.without_files(experiment.config, recording.selected)
-        with closing(parts.engine):
+        _, components, context = steps.without_files(experiment.config, recording.selected)
+        with closing(components.engine):
             last = Split.of(context.pairs, context.windows, context.split).frame
             found = context.calibrator.fixed(context.pairs, context.batch, last)
     ids = pd.Index(context.pairs.ids, name="pair_id")

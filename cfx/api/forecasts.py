@@ -128,8 +128,8 @@ def forecast(
         recording = pairs_from(pairs)
         chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
         experiment = config(recording, **chosen)
-        _, parts, context = steps.without_files(experiment.config, recording.selected)
-        finished = cast(Any, parts.protocol).finished
+        _, components, context = steps.without_files(experiment.config, recording.selected)
+        finished = cast(Any, components.protocol).finished
         finished.check(context.pairs)
         agent: Agent = finished.agent.to(context.batch.lengths.device)
         if samples and not agent.core.head.is_stochastic:
@@ -153,7 +153,7 @@ def forecast(
         network = torch.zeros_like(origins.pair)
         followers = Followers(context.batch, network, base, agent.context_rule.history_s)
         found = sample_from_origins(
-            context.simulator,
+            context.stepper,
             agent,
             followers,
             origins,

@@ -46,7 +46,7 @@ def report(result: Result, console: Console, *, verbose: bool = False) -> None:
         sentences += _undefined(compared)
     _say(sentences, console)
     for table in installed():
-        if table.name in result.tables and (verbose or table.part.always_printed):
+        if table.name in result.tables and (verbose or table.component.always_printed):
             for printed in _printed(table, evaluation, metrics):
                 console.print(printed)
     if verbose:

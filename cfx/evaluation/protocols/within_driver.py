@@ -105,7 +105,7 @@ class WithinDriver(Protocol):
             return None
         default = context.constant(DefaultPolicy(), fixed[:1])
         agents = {"default": (default, ("any",)), "policy": (policy, policy.names)}
-        return measure_platoons(context.simulator.model, agents)
+        return measure_platoons(context.stepper.model, agents)
 
 
 def _test_part(
