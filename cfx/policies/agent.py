@@ -1,8 +1,8 @@
 """The agent, which drives in evaluation, platoons and SUMO, and is saved as a policy.
 
-Each class says one thing. `AgentCore` is the policy itself: networks with their scaler, their inputs
-and their head, as pure functions, which training uses too. `AgentState` is what is remembered of
-drivers between two windows. `Agent` drives many of them, window by window;
+Each class says one thing. `AgentCore` is the policy itself: networks with their scaler, their
+inputs and their head, as pure functions, which training uses too. `AgentState` is what is
+remembered of drivers between two windows. `Agent` drives many of them, window by window;
 `cfx.policies.driver_step.DriverStep` drives step by step, for other programs. What an agent is told
 of drivers beforehand is a `DriverContext`, which `cfx.policies.known_drivers` measures.
 
