@@ -210,8 +210,8 @@ class Fit:
         first = self._last.to(batch.lengths.device)
         train = training_errors(context.calibrator, batch, first, parameters)
         errors = {
-            "pair_id": [pair.pair_id for pair in context.pairs],
-            "driver": [pair.driver for pair in context.pairs],
+            "pair_id": context.pairs.ids,
+            "driver": context.pairs.drivers,
             "method": method,
             "train_rmse_speed": train["rmse_speed"].cpu().numpy(),
             "train_rmse_gap": train["rmse_gap"].cpu().numpy(),
@@ -295,6 +295,6 @@ def calibrate(
         with closing(components.engine):
             last = Split.of(context.pairs, context.windows, context.split).frame
             found = context.calibrator.fixed(context.pairs, context.batch, last)
-    ids = pd.Index([pair.pair_id for pair in context.pairs], name="pair_id")
+    ids = pd.Index(context.pairs.ids, name="pair_id")
     table = pd.DataFrame(found.cpu().numpy(), ids, list(context.space.names))
     return Fit(experiment, recording, table, context, last)

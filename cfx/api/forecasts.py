@@ -198,7 +198,7 @@ def _tables(
     is_recorded = recorded.cpu().numpy().ravel()
     dt = context.batch.dt
     time = (int(origins.frame[0]) + np.arange(steps + 1)) * dt
-    ids = [pair.pair_id for pair in context.pairs]
+    ids = context.pairs.ids
     paths = []
     for number in range(len(found.speed)):
         table = _long(ids, time, found.speed[number], found.travelled[number])

@@ -71,8 +71,8 @@ class Origins:
     def columns(self, pairs: PairSet) -> dict[str, NDArray[np.object_]]:
         """Returns the columns with which a table of them begins: `pair_id` and `driver`."""
         index = self.pair.cpu().numpy()
-        ids = np.asarray([pair.pair_id for pair in pairs], dtype=object)
-        drivers = np.asarray([pair.driver for pair in pairs], dtype=object)
+        ids = np.asarray(pairs.ids, dtype=object)
+        drivers = np.asarray(pairs.drivers, dtype=object)
         return {"pair_id": ids[index], "driver": drivers[index]}
 
     def __len__(self) -> int:

@@ -293,7 +293,7 @@ def described(result: Result) -> str:
         if group == "learner" and result.purpose is Purpose.CALIBRATION:
             continue
         chosen.append(f"{group} **{result.setting(f'{group}.name')}**")
-    drivers = len({pair.driver for pair in pairs})
+    drivers = len(set(pairs.drivers))
     _, words = headline(result.metrics)
     source = Path(pairs.source).name
     lines = [

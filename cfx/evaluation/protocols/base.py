@@ -160,11 +160,11 @@ class ProtocolContext:
         if not self.policy.trainable:
             return
         learned_from = LearnedFrom(self.learner.learned_before)
-        known = [pair.pair_id for pair in tested if pair in learned_from]
-        if known:
+        not_new = tested.select([pair in learned_from for pair in tested], "learned from").ids
+        if not_new:
             raise DataError(
-                f"learner.start: that policy has learned from {len(known)} of the {len(tested)}"
-                f" pairs that are tested here, the first of them '{known[0]}'; test on others"
+                f"learner.start: that policy has learned from {len(not_new)} of the {len(tested)}"
+                f" pairs that are tested here, the first of them '{not_new[0]}'; test on others"
                 " (data.recording, data.pair_ids)"
             )
 

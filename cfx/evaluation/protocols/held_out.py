@@ -135,8 +135,8 @@ class HeldOut:
         loops = {"fixed": loops["fixed"], "alone": alone, "policy": loops["policy"]}
         table = pd.DataFrame(
             {
-                "pair_id": [pair.pair_id for pair in self.pairs],
-                "driver": [pair.driver for pair in self.pairs],
+                "pair_id": self.pairs.ids,
+                "driver": self.pairs.drivers,
                 "share": share,
                 "past_rmse_speed_fixed": np.sqrt(past.fixed),
                 "past_rmse_speed_alone": np.sqrt(past.policy),
@@ -217,8 +217,8 @@ class HeldOut:
         np.divide(error_of_fixed - speed, error_of_fixed, out=improvement, where=error_of_fixed > 0)
         return pd.DataFrame(
             {
-                "pair_id": [pair.pair_id for pair in self.pairs],
-                "driver": [pair.driver for pair in self.pairs],
+                "pair_id": self.pairs.ids,
+                "driver": self.pairs.drivers,
                 "history_s": observed,
                 "amount": text,
                 "rmse_speed": speed,

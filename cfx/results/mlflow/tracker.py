@@ -209,7 +209,7 @@ class MlflowTracker(Tracker):
 
         profile = {
             "pairs": len(pairs),
-            "drivers": len({pair.driver for pair in pairs}),
+            "drivers": len(set(pairs.drivers)),
             "frames": sum(len(pair) for pair in pairs),
             "time_step_s": pairs.dt,
             "fingerprint": pairs.fingerprint,

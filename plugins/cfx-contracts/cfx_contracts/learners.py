@@ -59,7 +59,7 @@ def training_data(
     pairs = _recording()
     split = Split.of(pairs, WINDOWS, 0.8)
     truth = _truth(pairs, model)
-    network, names = torch.arange(PAIRS), tuple(pair.pair_id for pair in pairs)
+    network, names = torch.arange(PAIRS), tuple(pairs.ids)
     if together:
         network, names = torch.zeros_like(network), ("all",)
     return TrainingData(
