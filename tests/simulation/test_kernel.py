@@ -465,3 +465,34 @@ def test_terms_of_single_frames_are_those_of_trajectories(every: int) -> None:
     assert single is not None
     torch.testing.assert_close(found[0], single[0][every - 1 :: every], rtol=0, atol=0)
     torch.testing.assert_close(single[0].sum(0), sums[0], rtol=1e-12, atol=1e-12)
+
+
+class AddsScaled(Krauss):
+    """Adds a multiple in one operation, which is not plain addition."""
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        speed = super().next_speed(follower, leader, p, dt)
+        return torch.sub(torch.add(speed, p["t_i"], alpha=2), p["t_i"], alpha=3)
+
+
+class SplitsAlike(Krauss):
+    """Cuts columns into some of one width."""
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        both = torch.stack([super().next_speed(follower, leader, p, dt), follower.speed], -1)
+        return both.split(1, dim=-1)[0][..., 0]
+
+
+@pytest.mark.parametrize("model", [AddsScaled(), SplitsAlike()])
+def test_operations_with_options_have_a_kernel_with_the_losses_of_pytorch(
+    model: DrivingModel,
+) -> None:
+    segments, p, objective = made_up_segments(), candidates_of(model), SpeedRmse()
+    losses = summed_up(MemoryStepper(model, DT, compile="always"), objective, segments, p)
+    expected = simulated(MemoryStepper(model, DT, compile="never"), objective, segments, p)
+    assert losses is not None
+    torch.testing.assert_close(losses, expected, rtol=1e-9, atol=1e-9)
