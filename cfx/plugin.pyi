@@ -225,8 +225,8 @@ from .evaluation.forecasts import (
 )
 from .evaluation.headline import (
     Comparison as Comparison,
-    contradiction as contradiction,
-    opposite as opposite,
+    doubts as doubts,
+    summaries_disagree as summaries_disagree,
 )
 from .evaluation.metrics.base import (
     Metric as Metric,
@@ -257,8 +257,9 @@ from .evaluation.result import (
 from .evaluation.sites import ALL_SITES as ALL_SITES
 from .evaluation.statistics import (
     Against as Against,
+    Ranking as Ranking,
     Improvement as Improvement,
-    against_the_best as against_the_best,
+    ranking_of as ranking_of,
     improvement_statistics as improvement_statistics,
     mean_interval as mean_interval,
     verdict as verdict,

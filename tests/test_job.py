@@ -97,9 +97,12 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.plugin.Result) ->
     expected |= {
         f"rmse_improvement/{name}"
         for name in (
-            "mean",
-            "trimmed_mean",
+            "geometric",
+            "ratio_of_means",
+            "mean_ratio",
+            "trimmed_mean_ratio",
             "median",
+            "drivers",
             "ci95_low",
             "ci95_high",
             "win_rate",
@@ -116,7 +119,8 @@ def test_the_terminal_says_what_matters(finished: cfx.plugin.Result) -> None:
         "driver-specific",
         "policy",
         "RMSE speed",
-        "95 % interval",
+        "policy better by %",
+        "In short: ",
         "Results:",
         "cfx ui",
         "http://127.0.0.1:5000",

@@ -65,7 +65,9 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         )
         result = steps.find(steps.compose(config, parts, pairs, style), parts, config)
         # Figures take seconds: the numbers are there before them.
-        result = result.write(folder, config, tell=partial(report, console=console))
+        result = result.write(
+            folder, config, tell=partial(report, console=console, verbose=config.output.verbose)
+        )
         # After the folder, so that no failure of MLflow loses it.
         tracker.log_job(result, described(result))
         if upload is not None:

@@ -370,7 +370,6 @@ def find(context: ProtocolContext, parts: Parts, config: JobConfig) -> Result:
         notes=delivered.notes,
         recorded=context.pairs,
         style=context.style,
-        seed=context.seed,
     )
     metrics = {**evaluation.metrics(), **delivered.calibration}
     if delivered.labels is not None:
@@ -391,7 +390,7 @@ def job_tables(
     tables = {"curves": learning_curves(delivered.curves)}
     if delivered.labels is not None:
         tables["labels"] = delivered.labels.to_frame(context.pairs, evaluation.names)
-    sites = site_table(context.pairs, evaluation, seed=context.seed)
+    sites = site_table(context.pairs, evaluation)
     if sites is not None:
         tables["sites"] = sites
     return tables

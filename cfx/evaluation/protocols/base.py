@@ -198,7 +198,6 @@ class ProtocolContext:
             tested,
             scopes,
             self.space,
-            seed=self.seed,
             policy_space=policy.core.head.model_space,
             metrics=self.metrics,
         )

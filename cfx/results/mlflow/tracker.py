@@ -423,7 +423,7 @@ def sweep_link(experiment_id: str, sweep: str) -> str:
         "searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'",
         # Sorted by date, MLflow's page would fold the jobs away under their parent, and draw no
         # charts.
-        "orderByKey": "metrics.`rmse_improvement/mean`",
+        "orderByKey": "metrics.`rmse_improvement/geometric`",
         "orderByAsc": "false",
         "compareRunsMode": "CHART",
         "workflowType": "machine_learning",

@@ -101,7 +101,7 @@ class Forecast(FoldsOrFinished):
     before the first origin.
 
     Errors of speed and position at each horizon are the RMSE over the origins of a driver, then the
-    mean over drivers, with a bootstrap interval over drivers: origins of one driver overlap and are
+    mean over drivers, with an interval over drivers: origins of one driver overlap and are
     not independent. ADE and FDE are the mean absolute error of position over the way to a horizon,
     and at it. A horizon counts the origins whose recording lasts that long.
 

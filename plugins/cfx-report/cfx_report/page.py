@@ -16,11 +16,8 @@ from cfx.plugin import (
     CLUSTER_COLOURS,
     CLUSTERS,
     COLOURS,
-    TEST,
-    Comparison,
     Purpose,
     Result,
-    contradiction,
     draw_figure,
     explained,
     few_drivers,
@@ -29,6 +26,7 @@ from cfx.plugin import (
     percent,
     plural,
     short_label,
+    summaries_disagree,
     write_output,
 )
 from cfx_report.inline import inline_scripts, security_policy
@@ -182,7 +180,7 @@ def summary(jobs: Sequence[Result]) -> list[str]:
         references.append(f"{len(constant)} jobs are calibrations, without adaptation.")
     if len(compared) <= _MOST:
         return [first, *map(_verdict, compared), *warnings, *references]
-    counts = f"{_counts(compared)} (by the 95 % interval of the mean improvement)."
+    counts = f"{_counts(compared)} (by the 95 % interval of the improvement)."
     return [first, counts, _best(jobs), *warnings, *references]
 
 
@@ -216,8 +214,8 @@ def _best(jobs: Sequence[Result]) -> str:
     rows = [row for row in rows_over_seeds(jobs) if of_purpose(row.jobs, Purpose.ADAPTATION)]
     best = max(rows, key=_mean_for_ranking)
     if len(best.jobs) == 1:
-        return f"The best mean: {_verdict(best.jobs[0])}"
-    gains = best.improvements("mean", "fixed")
+        return f"The best: {_verdict(best.jobs[0])}"
+    gains = best.improvements("geometric", "fixed")
     least, most = (percent(float(end), 1) for end in (np.nanmin(gains), np.nanmax(gains)))
     return (
         f"The best mean over seeds: {best.name}. Improvement of the RMSE of speed:"
@@ -227,7 +225,7 @@ def _best(jobs: Sequence[Result]) -> str:
 
 
 def _mean_for_ranking(row: Row) -> float:
-    means = row.improvements("mean", "fixed")
+    means = row.improvements("geometric", "fixed")
     known = means[np.isfinite(means)]
     return float(known.mean()) if len(known) else -np.inf
 
@@ -274,7 +272,7 @@ def _side(job: Result, baseline: str = "fixed") -> str:
 
 
 def _verdict(job: Result) -> str:
-    if not np.isfinite(job.statistics("fixed").mean):
+    if not np.isfinite(job.statistics("fixed").geometric):
         return f"{job.name}: no pair has a defined improvement."
     pooled = ""
     if "population" in job.baselines():
@@ -284,13 +282,13 @@ def _verdict(job: Result) -> str:
 
 
 def _gain(job: Result, baseline: str) -> str:
-    mean = job.statistics(baseline).mean
-    low, high = job.statistics(baseline).ci95_low, job.statistics(baseline).ci95_high
-    if not np.isfinite(mean):
+    improvement = job.statistics(baseline)
+    low, high = improvement.ci95_low, improvement.ci95_high
+    if not np.isfinite(improvement.geometric):
         return "not defined"
     sure = "no interval for a single driver"
     if np.isfinite(low):
         sure = f"95 % interval {percent(low, 1)} to {percent(high, 1)}"
-    said = f"{percent(mean, 1)} on average ({sure})"
-    opposite = contradiction(job.metrics, Comparison(baseline, TEST))
-    return f"{said}, {opposite}" if opposite else said
+    said = f"{percent(improvement.geometric, 1)} ({sure})"
+    note = summaries_disagree(improvement.geometric, improvement.ratio_of_means)
+    return f"{said}, {note}" if note else said

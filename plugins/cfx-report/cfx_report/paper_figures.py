@@ -124,16 +124,16 @@ def draw(
 
 def _compared(jobs: Sequence[Result], folder: Path, formats: Sequence[str]) -> list[str]:
     """Draws jobs against the one that is closest to the drivers; returns what to tell the user."""
-    from cfx.plugin import against_the_best, verdict, write_figure
+    from cfx.plugin import ranking_of, verdict, write_figure
     from cfx_report.figures.models import draw_models
 
     errors = {job.name: job.errors for job in jobs}
-    compared = against_the_best(errors)
-    if not compared:
+    ranking = ranking_of(errors)
+    if not ranking.against:
         return ["The jobs share no pairs on the same frames, so that they are not compared."]
-    figure = draw_models(errors, compared)
+    figure = draw_models(errors, ranking.against)
     paths = [write_figure(figure, folder / f"models.{form}") for form in formats]
-    return [verdict(compared), *[f"Model against model: {path.absolute()}" for path in paths]]
+    return [verdict(ranking), *[f"Model against model: {path.absolute()}" for path in paths]]
 
 
 def _width_mm(text: str) -> float:

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy.stats import gmean
 
 import cfx
 from cfx.calibration.cache import Cache
@@ -238,7 +239,9 @@ def test_every_baseline_has_its_improvement(result: cfx.plugin.Result) -> None:
     ):
         before = result.pairs[result.pairs.method == baseline].set_index("pair_id")
         gain = (before.rmse_speed - policy.rmse_speed) / before.rmse_speed
-        assert result.metrics[f"{key}/mean"] == pytest.approx(gain.mean())
+        geometric = 1 - gmean(1 - gain)
+        assert result.metrics[f"{key}/geometric"] == pytest.approx(geometric)
+        assert result.metrics[f"{key}/mean_ratio"] == pytest.approx(gain.mean())
         column = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
         assert policy[column].to_numpy() == pytest.approx(gain.to_numpy())
         whole = (
@@ -246,8 +249,8 @@ def test_every_baseline_has_its_improvement(result: cfx.plugin.Result) -> None:
         ) / before.full_trajectory_rmse_speed
         if baseline == "population":
             assert result.metrics[
-                "full_trajectory/rmse_improvement/population/mean"
-            ] == pytest.approx(whole.mean())
+                "full_trajectory/rmse_improvement/population/geometric"
+            ] == pytest.approx(1 - gmean(1 - whole))
         else:
             assert whole.isna().all(), (
                 "driver-specific parameters have seen the first part of the trajectory"
@@ -418,7 +421,7 @@ def test_without_learning_the_policy_is_its_base(base: str, shrinkage: float, me
     # What drawing does on its own is shown where it was done.
     is_drawn = base == "own" and shrinkage > 0
     assert ("shrunk" in rmse.index.get_level_values(0)) == is_drawn
-    assert ("rmse_improvement/shrunk/mean" in found.metrics()) == is_drawn
+    assert ("rmse_improvement/shrunk/geometric" in found.metrics()) == is_drawn
     assert "history" not in found.tables
 
 

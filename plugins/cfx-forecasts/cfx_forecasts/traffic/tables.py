@@ -22,6 +22,7 @@ class Roads(ResultTable):
 
     meaning = "simulated roads (`protocol=traffic`)"
     order = 140
+    always_printed = True
     columns = (
         METHOD,
         Column("road", "", "the kind of road", "text"),

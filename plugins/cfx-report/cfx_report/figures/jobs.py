@@ -47,7 +47,7 @@ _WIDE = 1.6
 
 
 _MARKERS = ("o", "s", "D", "P", "X", "*", "h", "p")
-_SHOWN = ("mean", "ci95_low", "ci95_high", "trimmed_mean", "median")
+_SHOWN = ("geometric", "ci95_low", "ci95_high", "ratio_of_means", "median")
 """Statistics of an improvement that are drawn."""
 
 _NAMED = 90
@@ -79,7 +79,7 @@ def statistics_axis(found: Iterable[Improvement], baseline: str) -> ImprovementA
     values: list[float] = []
     for one in found:
         values += finite([getattr(one, name) for name in _SHOWN]).tolist()
-    what = "means, medians and ends of intervals"
+    what = "improvements, medians and ends of intervals"
     return improvement_axis(np.array(values), baseline=baseline, what=what)
 
 
@@ -111,19 +111,20 @@ def error_limit(values: Mapping[str, Array], unit: str) -> tuple[float, str]:
 
 @styled
 def draw_overview(found: Mapping[str, Improvement], baseline: str, axis: ImprovementAxis) -> Figure:
-    """Draw mean improvement with its 95 % interval, trimmed mean and median: a line per job."""
+    """Draws the improvement with its interval, that of the mean errors, and the median, by job."""
     figure, axes, places = _by_job(list(found))
     colour = colour_of(baseline)
     for (job, row), place in zip(found.items(), places, strict=True):
-        reach = np.nan_to_num([[row.mean - row.ci95_low], [row.ci95_high - row.mean]])
+        centre = row.geometric
+        reach = np.nan_to_num([[centre - row.ci95_low], [row.ci95_high - centre]])
         drawn = axes.errorbar(
-            [row.mean], [place], xerr=reach, color=colour, marker="o", markersize=8, capsize=4
+            [centre], [place], xerr=reach, color=colour, marker="o", markersize=8, capsize=4
         )
         low, high = percent_or_undefined(row.ci95_low, 1), percent_or_undefined(row.ci95_high, 1)
-        said = f"{job}: mean {percent_or_undefined(row.mean, 1)}, 95 % interval {low} to {high}"
+        said = f"{job}: {percent_or_undefined(centre, 1)}, 95 % interval {low} to {high}"
         hover(drawn.lines[0], said)
         for name, value, marker in (
-            ("trimmed mean", row.trimmed_mean, "D"),
+            ("of the mean errors", row.ratio_of_means, "D"),
             ("median", row.median, "|"),
         ):
             mark = draw_points(axes, [value], [place], marker, "black", 8 if marker == "D" else 13)
@@ -133,8 +134,8 @@ def draw_overview(found: Mapping[str, Improvement], baseline: str, axis: Improve
     axes.set_xlim(axis.low, axis.high)
     axes.xaxis.set_major_formatter(FuncFormatter(percent_tick))
     axes.set_xlabel(f"{axis.title} (%)")
-    handles = [_mark("o", colour, "mean and its 95 % interval")]
-    handles += [_mark("D", "black", "trimmed mean"), _mark("|", "black", "median")]
+    handles = [_mark("o", colour, "improvement and its 95 % interval")]
+    handles += [_mark("D", "black", "of the mean errors"), _mark("|", "black", "median")]
     legend_above(figure, handles)
     return figure
 

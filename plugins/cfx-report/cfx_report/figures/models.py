@@ -15,10 +15,10 @@ from cfx.plugin import (
     canvas,
     draw_points,
     most_across,
-    opposite,
     percent,
     points,
     styled,
+    summaries_disagree,
     wrapped,
 )
 
@@ -32,8 +32,8 @@ def draw_models(errors: Mapping[str, pd.DataFrame], compared: Sequence[Against])
     """Draws a panel per other job: a dot per pair; above the line the best job is closer.
 
     Args:
-        errors: as `cfx.evaluation.statistics.against_the_best` takes them.
-        compared: as it returns them; at least one.
+        errors: as `cfx.evaluation.statistics.ranking_of` takes them.
+        compared: as it returns them in `against`; at least one.
     """
     shown = compared[:_MOST]
     across = min(most_across(_ACROSS), len(shown))
@@ -52,9 +52,11 @@ def draw_models(errors: Mapping[str, pd.DataFrame], compared: Sequence[Against])
         axes.set_xlim(0, end)
         axes.set_ylim(0, end)
         axes.set_aspect("equal")
-        lead = f"{percent(one.found.mean, 1)} (p = {one.p_value:.2g})"
-        if opposite(one.found.mean, one.of_means):
-            lead += f"; of the means {percent(one.of_means, 1)}"
+        improvement = one.improvement
+        lead = f"{percent(improvement.geometric, 1)} (p = {one.p_value:.2g})"
+        note = summaries_disagree(improvement.geometric, improvement.ratio_of_means)
+        if note:
+            lead += f"; {note}"
         axes.set_title(f"{one.best} over {one.other}\n{lead}")
         axes.set_xlabel(wrapped(f"RMSE of speed of {one.best} (m/s)"))
         axes.set_ylabel(wrapped(f"RMSE of speed of {one.other} (m/s)"))

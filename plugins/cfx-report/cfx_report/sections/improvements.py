@@ -28,7 +28,7 @@ from cfx_report.names import SEPARATOR, differences
 from cfx_report.section import Cell, Column, Section, Sheet, View, formatted, number
 from cfx_report.sections.results import STATISTICS
 
-_STATISTICS = ("mean", "ci95_low", "ci95_high")
+_STATISTICS = ("geometric", "ci95_low", "ci95_high")
 
 Pair = Mapping[str, Any]
 """A row of `Result.by_pair`."""
@@ -252,4 +252,4 @@ def statistics(table: pd.DataFrame, baseline: str) -> Improvement:
 
     before = table[f"rmse_speed/{baseline}"].to_numpy(dtype=float)
     after = table["rmse_speed/policy"].to_numpy(dtype=float)
-    return improvement_statistics(before, after, table["driver"].astype(str).tolist(), seed=0)
+    return improvement_statistics(before, after, table["driver"].astype(str).tolist())
