@@ -58,7 +58,7 @@ def missing_names(path: Path) -> list[str]:
     it, below that, or where its path says.
     """
     source = path.read_text(encoding="utf-8")
-    kinds = (*registry.KINDS.values(), *registry.PARTS.values())
+    kinds = (*registry.KINDS.values(), *registry.SIMPLE_KINDS.values())
     groups = {registry.API_GROUP, *(kind.entry_points for kind in kinds)}
     missing = []
     for line, text in explanations(source):

@@ -324,18 +324,20 @@ def test_the_guide_names_what_the_door_has() -> None:
     names = set(re.findall(r"\bcfx\.plugin\.(\w+)", text))
     assert len(names) > 20
     assert names <= set(cfx.plugin.__all__)
-    groups = {kind.entry_points for kind in (*registry.KINDS.values(), *registry.PARTS.values())}
+    groups = {
+        kind.entry_points for kind in (*registry.KINDS.values(), *registry.SIMPLE_KINDS.values())
+    }
     doors = {"cfx.plugin", "cfx.errors", "cfx.sklearn", registry.API_GROUP}
     assert set(re.findall(r"\bcfx\.[a-z]+\b", text)) <= groups | doors
 
 
-def test_the_table_of_parts_names_what_is_there() -> None:
+def test_the_table_of_simple_kinds_names_what_is_there() -> None:
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\w+) \| `(cfx\.\w+)` \| `([\w.]+)` \|", text, flags=re.MULTILINE)
-    assert {part for part, _, _ in rows} == set(registry.PARTS)
-    for part, group, base in rows:
-        assert registry.PARTS[part].entry_points == group
-        assert pkgutil.resolve_name(base) is pkgutil.resolve_name(registry.PARTS[part].base)
+    assert {kind for kind, _, _ in rows} == set(registry.SIMPLE_KINDS)
+    for kind, group, base in rows:
+        assert registry.SIMPLE_KINDS[kind].entry_points == group
+        assert pkgutil.resolve_name(base) is pkgutil.resolve_name(registry.SIMPLE_KINDS[kind].base)
 
 
 @pytest.mark.slow

@@ -133,7 +133,7 @@ KINDS: dict[str, Kind] = {
 }
 """All kinds, by name."""
 
-PARTS: dict[str, Kind] = {
+SIMPLE_KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         Kind("figure", "cfx.results.figure:JobFigure", chosen=False),
@@ -212,12 +212,12 @@ def add_kind(kind: Kind) -> None:
     """
     if every_kind().get(kind.name, kind) != kind:
         raise PluginError(f"there is a kind '{kind.name}' already; choose another name")
-    PARTS[kind.name] = kind
+    SIMPLE_KINDS[kind.name] = kind
 
 
 def every_kind() -> dict[str, Kind]:
     """Returns all kinds by name: components first, then what comes in the same way."""
-    return {**KINDS, **PARTS}
+    return {**KINDS, **SIMPLE_KINDS}
 
 
 def kind_of(kind: str) -> Kind:
@@ -366,13 +366,13 @@ class Installed(Generic[T]):
     Attributes:
         kind: such as "figure".
         name: of its entry point.
-        part: what it is.
+        component: what it is.
         distribution: who brings it.
     """
 
     kind: str
     name: str
-    part: T
+    component: T
     distribution: str
 
     def attempt(self, work: Callable[[T], R], without: R) -> R:
@@ -382,7 +382,7 @@ class Installed(Generic[T]):
         returned: the job has its results.
         """
         try:
-            return work(self.part)
+            return work(self.component)
         except Exception as error:
             if self.distribution == OWN:
                 raise
@@ -414,14 +414,14 @@ def _installed(
             _warn_of_left_out(found, f"{others[0].distribution} brings one of that name")
             continue
         try:
-            part: Any = create(kind, {"name": found.name})
+            component: Any = create(kind, {"name": found.name})
         except PluginError as error:
             if found.distribution == OWN:
                 raise
             _warn_of_left_out(found, str(error))
             continue
-        made.append(Installed(kind, found.name, part, found.distribution))
-    return tuple(sorted(made, key=lambda one: (one.part.order, one.name)))
+        made.append(Installed(kind, found.name, component, found.distribution))
+    return tuple(sorted(made, key=lambda one: (one.component.order, one.name)))
 
 
 def _warn_of_left_out(one: Entry | Installed[Any], reason: str) -> None:

@@ -334,6 +334,16 @@ class PairSet(Sequence[Pair]):
                 raise DataError(f"{self.source}: pair id '{pair.pair_id}' stands for two pairs")
             seen.add(pair.pair_id)
 
+    @property
+    def ids(self) -> list[str]:
+        """The name of each pair."""
+        return [pair.pair_id for pair in self.pairs]
+
+    @property
+    def drivers(self) -> list[str]:
+        """The driver of each pair: several pairs may have the same."""
+        return [pair.driver for pair in self.pairs]
+
     def __len__(self) -> int:
         return len(self.pairs)
 

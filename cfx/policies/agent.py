@@ -141,19 +141,19 @@ class Agent:
         """The parameters that the agent chooses, with their bounds."""
         return self.core.head.space
 
-    def stepper(self, simulator: Stepper) -> Stepper:
+    def stepper(self, stepper: Stepper) -> Stepper:
         """Returns what takes the steps of the model that this agent drives.
 
         Args:
-            simulator: takes those of the job's driving model.
+            stepper: takes those of the job's driving model.
 
         Raises:
             ConfigError: the head needs a model around it, which this simulator does not have.
         """
-        model = self.core.head.driven_model(simulator.model)
-        if model is simulator.model:
-            return simulator
-        return simulator.for_model(model)
+        model = self.core.head.driven_model(stepper.model)
+        if model is stepper.model:
+            return stepper
+        return stepper.for_model(model)
 
     def begin(self, network: Tensor, context: DriverContext = UNSEEN) -> AgentState:
         """Returns the state of D drivers before their first window.

@@ -66,7 +66,7 @@ def render(runs: Runs, title: str | None = None) -> str:
     for one in installed("section"):
         body = one.attempt(lambda section: _section(environment, section, runs), "")
         if body.strip():
-            sections.append((one.name, one.part, Markup(body)))  # noqa: S704 - a template's
+            sections.append((one.name, one.component, Markup(body)))  # noqa: S704 - a template's
     scripts = inline_scripts([_asset(name) for name in _SCRIPTS])
     return environment.get_template("page.html.j2").render(
         title=title or _title(runs.jobs),
@@ -96,7 +96,7 @@ def _environment(runs: Runs) -> Environment:
 
     environment.globals |= {
         "drawn": functools.partial(_drawn, environment),
-        "caption": lambda name: figure_named(name).part.caption,
+        "caption": lambda name: figure_named(name).component.caption,
         "lacking": lambda file, what: lacking(runs.jobs, file, what),
         "most": MOST,
         "next_number": itertools.count(1).__next__,
@@ -114,7 +114,7 @@ def _drawn(environment: Environment, name: str, job: Result) -> Any:
     if drawing is None:
         return ""
     figure: Any = environment.globals["figure"]
-    return figure({"": View(drawing)}, found.part.title)
+    return figure({"": View(drawing)}, found.component.title)
 
 
 def _section(environment: Environment, section: Section, runs: Runs) -> str:
