@@ -11,7 +11,7 @@
 #   make dist                                 build cfx and the plugins into dist/, install them into a clean environment, try them
 #   make docs                                 build the site from docs/ and the docstrings into site/; warnings are errors
 #   make tutorials                            run the tutorials and write their pages anew (a quarter of an hour)
-#   make conf                                 write anew what follows from the code: conf/<group>/<name>.yaml, which plugin brings what, the door's page
+#   make conf                                 write anew what follows from the code: conf/<group>/<name>.yaml, which plugin brings what, the door's page, templates
 #   make lock                                 write constraints.txt anew from what resolves today
 #   make clean                                remove .venv and every cache; outputs/ stays
 
@@ -86,6 +86,7 @@ dist: $(VENV)/.ready-test
 conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.app.nodes
 	$(BIN)/python docs/door.py
+	$(BIN)/python plugins/cfx-contracts/templates.py
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
 # What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark, SUMO, traffic.
