@@ -17,8 +17,6 @@ from .core.parameters import (
 )
 from .core.registry import (
     KINDS as KINDS,
-    Kind as Kind,
-    add_kind as add_kind,
     create as create,
     entries as entries,
     get as get,

@@ -1,10 +1,26 @@
 """Where things lie in the checkout that is tested, and its scripts."""
 
+import importlib.metadata
 import importlib.util
 from pathlib import Path
 from types import ModuleType
 
+import pytest
+
 ROOT = Path(__file__).resolve().parent.parent
+DISTRIBUTIONS = sorted(path.parent.name for path in ROOT.glob("plugins/*/pyproject.toml"))
+
+
+def require_distributions() -> None:
+    """Skips a module that looks at everything in `plugins/`, where some of it is not installed."""
+    missing = []
+    for name in DISTRIBUTIONS:
+        try:
+            importlib.metadata.distribution(name)
+        except importlib.metadata.PackageNotFoundError:
+            missing.append(name)
+    if missing:
+        pytest.skip(f"not installed: {', '.join(missing)}", allow_module_level=True)
 
 
 def module_of(script: Path) -> ModuleType:

@@ -13,15 +13,16 @@ import pytest
 import yaml
 
 import cfx
-import cfx_report.section  # noqa: F401 - adds the kind of sections
 from cfx.app.hydra_source import composed
 from cfx.core import registry
 from cfx.data.tidy import write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx_contracts import contract_for
-from tests.checkout import ROOT, module_of
+from tests.checkout import ROOT, module_of, require_distributions
 from tests.printed import Reader, all_blocks, blocks
 from tests.test_imports import FLOORS
+
+require_distributions()
 
 COMMANDS = registry.names("command")
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md"))
@@ -305,18 +306,20 @@ def test_the_guide_names_what_the_door_has() -> None:
     names = set(re.findall(r"\bcfx\.plugin\.(\w+)", text))
     assert len(names) > 20
     assert names <= set(cfx.plugin.__all__)
-    groups = {kind.entry_points for kind in (*registry.KINDS.values(), *registry.PARTS.values())}
-    doors = {"cfx.plugin", "cfx.errors", "cfx.get", "cfx.sklearn", registry.API_GROUP}
+    groups = {kind.entry_points for kind in registry.every_kind().values()}
+    groups |= {registry.API_GROUP, registry.KINDS_GROUP}
+    doors = {"cfx.plugin", "cfx.errors", "cfx.get", "cfx.sklearn"}
     assert set(re.findall(r"\bcfx\.[a-z]+\b", text)) <= groups | doors
 
 
 def test_the_table_of_parts_names_what_is_there() -> None:
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\w+) \| `(cfx\.\w+)` \| `([\w.]+)` \|", text, flags=re.MULTILINE)
-    assert {part for part, _, _ in rows} == set(registry.PARTS)
+    kinds = registry.every_kind()
+    assert {part for part, _, _ in rows} == set(kinds) - set(registry.KINDS)
     for part, group, base in rows:
-        assert registry.PARTS[part].entry_points == group
-        assert pkgutil.resolve_name(base) is pkgutil.resolve_name(registry.PARTS[part].base)
+        assert kinds[part].entry_points == group
+        assert pkgutil.resolve_name(base) is pkgutil.resolve_name(kinds[part].base)
 
 
 @pytest.mark.slow

@@ -18,11 +18,12 @@ import pytest
 
 import cfx
 import cfx.plugin
-import cfx_report.section  # noqa: F401 - adds the kind of sections
 from cfx.core import registry
+from tests.checkout import ROOT, require_distributions
 from tests.printed import blocks
 
-ROOT = Path(__file__).resolve().parent.parent
+require_distributions()
+
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
 DOORS = ("cfx", "cfx.plugin", "cfx.errors", "cfx.sklearn")
 """What a plugin may import of cfx. `cfx_contracts` is a door itself: it looks at all that it tests."""
@@ -131,11 +132,12 @@ def test_the_wheel_holds_the_package_its_licence_and_its_entry_points(
 
 @pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
 def test_what_it_announces_is_installed_here_and_loads(plugin: Path) -> None:
-    kinds = (*registry.KINDS.values(), *registry.PARTS.values())
-    groups = {kind.entry_points: kind.name for kind in kinds}
+    groups = {kind.entry_points: kind.name for kind in registry.every_kind().values()}
     points = project(plugin)["entry-points"]
     assert isinstance(points, dict)
     points.pop(registry.API_GROUP, None)  # the version of the plugin API, which is no component
+    for name, target in points.pop(registry.KINDS_GROUP, {}).items():
+        assert registry.kind_of(name).base == target
     assert set(points) <= set(groups)
     for group, announced in points.items():
         for name, target in announced.items():

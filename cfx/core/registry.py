@@ -49,6 +49,9 @@ R = TypeVar("R")
 THIS_PROCESS = "this process"
 """Stands for the distribution of a component that a program has added."""
 
+KINDS_GROUP = "cfx.kinds"
+"""Entry-point group in which a distribution announces a kind of its own: name and base class."""
+
 API_GROUP = "cfx.api"
 """Entry-point group in which a distribution says which version of the plugin API it needs."""
 
@@ -147,7 +150,7 @@ PARTS: dict[str, Kind] = {
 }
 """Kinds of classes that come in the same way, have no settings, and no contract in cfx-contracts.
 
-`add_kind` adds those of other distributions.
+Other distributions have more of them, by an entry point of the group `cfx.kinds` each.
 """
 
 GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
@@ -201,20 +204,22 @@ _tried: set[tuple[Entry, str]] = set()
 """Components that were tried, with their settings as JSON."""
 
 
-def add_kind(kind: Kind) -> None:
-    """Adds a kind of a distribution of its own, whose classes come in by `kind.entry_points`.
-
-    Raises:
-        PluginError: there is another kind of that name.
-    """
-    if every_kind().get(kind.name, kind) != kind:
-        raise PluginError(f"there is a kind '{kind.name}' already; choose another name")
-    PARTS[kind.name] = kind
-
-
 def every_kind() -> dict[str, Kind]:
-    """Returns all kinds by name: components first, then what comes in the same way."""
-    return {**KINDS, **PARTS}
+    """Returns all kinds by name: components first, then what comes in the same way.
+
+    Those of other distributions come last. Imports nothing.
+    """
+    return {**KINDS, **PARTS, **_kinds_of_plugins(_search_path())}
+
+
+@functools.lru_cache(maxsize=1)
+def _kinds_of_plugins(search_path: tuple[tuple[str, float], ...]) -> dict[str, Kind]:
+    """Returns the kinds that other distributions announce: an entry point is a base class each."""
+    kinds = {}
+    for announced in _announced(search_path).get(KINDS_GROUP, ()):
+        if announced.name not in KINDS and announced.name not in PARTS:
+            kinds[announced.name] = Kind(announced.name, announced.target, chosen=False)
+    return kinds
 
 
 def kind_of(kind: str) -> Kind:
@@ -579,7 +584,7 @@ def _announced(
 
 def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[str, Entry]]:
     """Yields what one distribution announces, each with its entry-point group."""
-    kinds = {kind.entry_points: kind.name for kind in every_kind().values()}
+    kinds = {kind.entry_points: kind.name for kind in (*KINDS.values(), *PARTS.values())}
     points = [point for point in distribution.entry_points if point.group.startswith("cfx.")]
     api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
     ours = [point for point in points if point.group != API_GROUP]

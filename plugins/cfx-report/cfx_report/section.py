@@ -17,8 +17,6 @@ from cfx.plugin import (
     NOTHING,
     Component,
     Job,
-    Kind,
-    add_kind,
     explained,
     percent,
     short_label,
@@ -27,9 +25,6 @@ from cfx_report.jobs import Runs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-add_kind(Kind("section", "cfx_report.section:Section", chosen=False))
 
 
 @dataclass(frozen=True)
