@@ -14,10 +14,13 @@ from matplotlib.figure import Figure
 
 import cfx
 from cfx.app import cli, hydra_source, nodes
-from tests.checkout import ROOT
+from tests.checkout import DISTRIBUTIONS, ROOT, is_installed, needs
 
 FOLDER = nodes.conf_dir() / "experiment"
-FOLDERS = [FOLDER, *sorted(ROOT.glob("plugins/*/cfx_*/conf/experiment"))]
+FOLDERS = [FOLDER]
+for distribution in DISTRIBUTIONS:
+    if is_installed(distribution):
+        FOLDERS += (ROOT / "plugins" / distribution).glob("cfx_*/conf/experiment")
 FILES = {
     str(path.relative_to(folder).with_suffix("")): path
     for folder in FOLDERS
@@ -89,6 +92,7 @@ def test_an_experiment_sweeps_without_being_told(
         assert "rmse_improvement/population/mean" in json.loads((job / "metrics.json").read_text())
 
 
+@needs("cfx-report")
 def test_one_pair_has_its_table_and_its_speed_plots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -17,6 +17,7 @@ from cfx.app.overrides import override
 from cfx.calibration.calibrator import Calibrator
 from cfx.errors import CfxError, ConfigError, DataError, ParameterError
 from cfx.results.table import read_tables
+from tests.checkout import needs
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 256}
 LEADER = pd.DataFrame({"time_s": np.arange(600) * 0.1, "speed": 15.0})
@@ -92,6 +93,7 @@ def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
     assert "driver-specific" in repr(fit)
 
 
+@needs("cfx-posteriors")
 def test_a_posterior_is_that_of_the_command_and_gives_new_drivers(
     pairs: cfx.Pairs, tmp_path: Path
 ) -> None:

@@ -13,6 +13,7 @@ import pytest
 
 import cfx
 from cfx.errors import ConfigError, DataError
+from tests.checkout import needs
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 64}
 SMALL = {
@@ -120,6 +121,7 @@ def test_a_forecast_reads_nothing_after_its_moment(others: cfx.Pairs) -> None:
     assert found[0].paths.groupby("pair_id").size().tolist() == [31, 31]
 
 
+@needs("cfx-forecasts")
 def test_a_forecast_is_that_of_the_protocol_to_the_last_bit(others: cfx.Pairs) -> None:
     policy = "cfx://i80-idm"
     settings = {"protocol.horizons": [2.0], "protocol.stride": 60.0}  # one moment
