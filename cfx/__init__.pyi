@@ -16,8 +16,7 @@ from .api.pairs import Pairs as Pairs
 from .api.pairs import read as read
 from .api.simulation import simulate as simulate
 from .app.application import run as run
-from .app.job.results import JobResult as JobResult
-from .app.job.results import load as load
 from .core.registry import get as get
+from .results.reading import load as load
 
 __version__: str

@@ -269,13 +269,19 @@ from .core.job_folder import (
 )
 from .results.config import JobConfig as JobConfig
 from .results.provenance import flatten as flatten
+from .results.figure import JobFigure as JobFigure
+from .results.reading import read_result as read_result
+from .results.result import (
+    OUTSIDE as OUTSIDE,
+    ParameterAxis as ParameterAxis,
+    Result as Result,
+)
 from .results.table import (
     Column as Column,
-    Findings as Findings,
-    Kept as Kept,
     ResultTable as ResultTable,
+    Tables as Tables,
     metrics_table as metrics_table,
-    read_tables as read_tables,
+    stored_tables as stored_tables,
 )
 from .results.tracker import (
     Origin as Origin,
@@ -317,17 +323,13 @@ from .figures.canvas import (
     wrapped as wrapped,
     write_note as write_note,
 )
-from .figures.figure import (
+from .figures.drawing import (
     FIGURE_METADATA as FIGURE_METADATA,
-    JobFigure as JobFigure,
-    ParameterAxis as ParameterAxis,
-    Results as Results,
     draw_figure as draw_figure,
     figure_named as figure_named,
     write_figure as write_figure,
     write_figures as write_figures,
 )
-from .figures.job import Job as Job, OUTSIDE as OUTSIDE, read_job as read_job
 from .figures.text import (
     BAND as BAND,
     CLUSTER_COLOURS as CLUSTER_COLOURS,

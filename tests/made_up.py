@@ -66,8 +66,9 @@ def make_results(
         if baseline != "policy":
             improvements[baseline] = summarize(evaluation.table)
     evaluation = dataclasses.replace(evaluation, improvements={"test": improvements})
+    style = make_style([one.driver for one in trajectories], rng)
     curves = make_curves(pairs if networks is None else networks, epochs, seed)
-    return MadeUp(evaluation, make_style([one.driver for one in trajectories], rng), curves)
+    return MadeUp(dataclasses.replace(evaluation, style=style), style, curves)
 
 
 def make_trajectory(

@@ -226,7 +226,7 @@ def test_the_readmes_python_runs(
     exec(block, names)  # noqa: S102 - it is our own README
     fit, result = names["fit"], names["result"]
     assert isinstance(fit, cfx.Fit)
-    assert isinstance(result, cfx.JobResult)
+    assert isinstance(result, cfx.plugin.Result)
     assert "ci95_low" in capsys.readouterr().out
     (command,) = [one for one in commands() if one.endswith("data=tidy data.path=pairs.csv")]
     printed_config = cfx.config(**dict(word.split("=", 1) for word in shlex.split(command)[3:]))

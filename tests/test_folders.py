@@ -12,7 +12,6 @@ import pytest
 import yaml
 
 from cfx.app import cli
-from cfx.app.job import results
 from cfx.core.files import atomic_write, remove_leftovers
 from cfx.errors import CfxError
 from cfx.evaluation.protocols.within_driver import WithinDriver
@@ -62,7 +61,7 @@ def test_while_results_are_replaced_nothing_says_that_they_are_complete(
         raise CfxError("the disk is full")
 
     with monkeypatch.context() as broken:
-        broken.setattr(results, "tables_of", fail)
+        broken.setattr("cfx.results.result.tables_of", fail)
         assert job(folder, "seed=2") == 2
     assert not (folder / "metrics.json").exists()
     assert job(folder, "seed=2") == 0

@@ -42,7 +42,7 @@ class JobError(Exception):
     """What a job ends with here."""
 
 
-_finished: list[cfx.JobResult] = []
+_finished: list[cfx.plugin.Result] = []
 """The job that a program ran, for those who look at it later."""
 
 

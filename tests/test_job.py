@@ -43,12 +43,12 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("MLFLOW_TRACKING_URI", raising=False)
 
 
-def run(*overrides: str) -> cfx.JobResult:
+def run(*overrides: str) -> cfx.plugin.Result:
     return cfx.run([*QUICK, *overrides])
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
+def finished(tmp_path_factory: pytest.TempPathFactory) -> cfx.plugin.Result:
     """A job with everything on, by the command line."""
     folder = tmp_path_factory.mktemp("job")
     everything = ["debug=quick", "data.pairs=3", "data.frames=200", "data.max_pairs=null"]
@@ -65,7 +65,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
     return cfx.load(folder / "out")
 
 
-def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> None:
+def test_the_folder_holds_what_the_contract_says(finished: cfx.plugin.Result) -> None:
     folder = finished.folder
     names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert {
@@ -109,7 +109,7 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.JobResult) -> Non
     assert expected | {"collisions/policy"} <= set(metrics)
 
 
-def test_the_terminal_says_what_matters(finished: cfx.JobResult) -> None:
+def test_the_terminal_says_what_matters(finished: cfx.plugin.Result) -> None:
     text = (finished.folder.parent / "stdout.txt").read_text()
     for word in (
         "default",
@@ -125,14 +125,14 @@ def test_the_terminal_says_what_matters(finished: cfx.JobResult) -> None:
     assert "Traceback" not in (finished.folder.parent / "stderr.txt").read_text()
 
 
-def test_a_row_per_pair_and_method(finished: cfx.JobResult) -> None:
+def test_a_row_per_pair_and_method(finished: cfx.plugin.Result) -> None:
     assert len(finished.pairs) == 9
     means = finished.pairs.groupby("method").rmse_speed.mean()
     for method in ("default", "fixed", "policy"):
         assert finished.metrics[f"rmse_speed/{method}"] == pytest.approx(means[method])
 
 
-def test_every_window_has_its_label_and_spread(finished: cfx.JobResult) -> None:
+def test_every_window_has_its_label_and_spread(finished: cfx.plugin.Result) -> None:
     labels = pd.read_parquet(finished.folder / "labels.parquet")
     # 200 frames are 39 windows of 5 steps, of which the first 80 % are calibrated.
     assert labels.groupby("pair_id").size().tolist() == [31, 31, 31]
@@ -143,7 +143,9 @@ def test_every_window_has_its_label_and_spread(finished: cfx.JobResult) -> None:
     assert finished.metrics["labels/loss"] == pytest.approx(labels.loss.mean())
 
 
-def test_a_calibration_says_its_objective_and_reports_the_others(finished: cfx.JobResult) -> None:
+def test_a_calibration_says_its_objective_and_reports_the_others(
+    finished: cfx.plugin.Result,
+) -> None:
     described = json.loads((finished.folder / "data.json").read_text())
     assert described["objective"] == {"name": "speed_rmse", "unit": "m/s"}
     for entry in registry.entries("objective"):
@@ -162,7 +164,7 @@ def test_another_objective_calibrates_other_parameters() -> None:
         assert better.metrics[metric] < worse.metrics[metric], name
 
 
-def test_synthetic_data_keeps_its_truth(finished: cfx.JobResult) -> None:
+def test_synthetic_data_keeps_its_truth(finished: cfx.plugin.Result) -> None:
     table = pd.read_parquet(finished.folder / "data.parquet")
     assert {"true_t_r", "true_t_i", "true_model"} <= set(table.columns)
 
@@ -174,7 +176,7 @@ def test_synthetic_data_keeps_its_truth(finished: cfx.JobResult) -> None:
     "ignore:.*Any type hint is inferred as AnyType:UserWarning"
 )  # inside MLflow, at its import
 def test_the_policy_in_mlflow_predicts_the_same(
-    finished: cfx.JobResult, monkeypatch: pytest.MonkeyPatch
+    finished: cfx.plugin.Result, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import mlflow
 

@@ -12,12 +12,10 @@ import pytest
 from rich.console import Console
 
 from cfx.app.job.console import report, report_places
-from cfx.app.job.results import tables_of
-from cfx.data.pairs import PairSet
-from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
-from cfx.results.table import Findings, installed
+from cfx.results.result import Result
+from cfx.results.table import file_of, installed, tables_of
 from tests.made_up import GAINS, make_history, make_platoon, make_results, with_metric
 
 
@@ -30,16 +28,9 @@ def said(evaluation: Evaluation, *, width: int = 200, folder: str = "folder") ->
     """Returns what a job prints."""
     out = io.StringIO()
     console = Console(file=out, width=width)
-    report(findings(evaluation), evaluation.metrics(), (), console)
+    report(Result.of(evaluation), console)
     report_places(Path(folder), console, cast(Any, Untracked()))
     return out.getvalue()
-
-
-def findings(evaluation: Evaluation) -> Findings:
-    """Returns an evaluation as if a job had found it."""
-    made = make_results(pairs=1, frames=5)
-    found = ProtocolResult(evaluation, cast(Any, None), made.curves, None)
-    return Findings(PairSet((), "made up"), made.style, found)
 
 
 def measured(hard_braking: dict[str, int], at_bounds: dict[str, float]) -> Evaluation:
@@ -156,10 +147,11 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
         evaluation = dataclasses.replace(
             evaluation, platoon=make_platoon({"policy": 1}), tables={"history": history}
         )
-    written = tables_of(findings(evaluation), installed(), tmp_path)
-    further = {one.file for one in written if not one.about.part.always}
+    tables, _ = tables_of(evaluation, installed(), tmp_path)
+    written = {file_of(table): table.part for table in installed() if table.name in tables}
+    further = {file for file, table in written.items() if not table.always}
     assert further == {"pair_metrics.parquet", *(names if present else ())}
-    assert {path.name for path in tmp_path.iterdir()} == {one.file for one in written}
+    assert {path.name for path in tmp_path.iterdir()} == set(written)
     if present:
         assert set(pd.read_parquet(tmp_path / "platoon.parquet")) == {
             "method",

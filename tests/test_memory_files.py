@@ -174,5 +174,5 @@ def test_a_job_in_files_and_in_parts_has_the_same_results(
         pd.testing.assert_frame_equal(table(found, file), table(expected, file))
 
 
-def table(job: cfx.JobResult, file: str) -> Any:
+def table(job: cfx.plugin.Result, file: str) -> Any:
     return pd.read_parquet(job.folder / file)

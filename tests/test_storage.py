@@ -10,7 +10,6 @@ import pytest
 
 import cfx
 from cfx.app import cli
-from cfx.app.job.results import Upload, place_of
 from cfx.app.sweep.folder import fingerprint
 from cfx.calibration.cache import Cache
 from cfx.core import registry, storage
@@ -19,6 +18,7 @@ from cfx.core.storage import RemoteFolder, is_url, local_copies, state
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.errors import CfxError, DataError, OutputError
 from cfx.results.config import JobConfig
+from cfx.results.folder import Upload, place_of
 from tests.broken_plugins import QUICK
 from tests.drives import straight_pairs
 

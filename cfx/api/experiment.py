@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from cfx.api.pairs import Pairs, PairsLike, pairs_from
-from cfx.app.job.results import JobResult, read_config
 from cfx.app.job.run import compute
 from cfx.app.overrides import IN_MEMORY, command_of, config_of
 from cfx.core import registry
@@ -21,9 +20,11 @@ from cfx.models.base import DrivingModel
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.results.config import JobConfig
+from cfx.results.folder import read_config
+from cfx.results.result import Result
 from cfx.results.tracker import folder_of
 
-PolicyLike = JobResult | Agent | str | Path
+PolicyLike = Result | Agent | str | Path
 """A policy: a result that has one, the policy itself, a job's folder, or `cfx://NAME`."""
 
 M = TypeVar("M", bound=DrivingModel)
@@ -53,8 +54,8 @@ class Experiment:
         with visit():
             return command_of(self.config)
 
-    def run(self) -> JobResult:
-        """Runs it in this process; writes nothing (`JobResult.save` does).
+    def run(self) -> Result:
+        """Runs it in this process; writes nothing (`Result.save` does).
 
         Raises:
             CfxError: whatever the command line would print and exit 2 for.
@@ -96,15 +97,18 @@ def config(pairs: PairsLike | None = None, /, **settings: Any) -> Experiment:
         return Experiment(JobConfig.of({**found.model_dump(), **node}), recording)
 
 
-def from_config(job: str | Path) -> Experiment:
+def from_config(job: Result | str | Path) -> Experiment:
     """Reads the configuration of a finished job, to look at it, change it or run it again.
 
     Args:
-        job: a job's folder or the URL of its copy, the id of its MLflow run, or a `config.yaml`.
+        job: a result, a job's folder or the URL of its copy, the id of its MLflow run, or a
+            `config.yaml`.
 
     Raises:
         DataError: there is no such job, or it has no configuration that this version knows.
     """
+    if isinstance(job, Result):
+        return Experiment(JobConfig.of(job.config))
     path = Path(job)
     if path.suffix not in {".yaml", ".yml"}:
         path = folder_of(job) / "config.yaml"
@@ -118,7 +122,7 @@ def train(
     for_: str = "unseen_drivers",
     seed: int = 0,
     **settings: Any,
-) -> JobResult:
+) -> Result:
     """Trains a policy that adapts a model's parameters, as `experiment=FOR_ model=MODEL` does.
 
     It takes minutes. The drivers are divided into folds, and each is tested by a network that
@@ -151,7 +155,7 @@ def train(
     return config(pairs_from(pairs), experiment=for_, model=model, seed=seed, **settings).run()
 
 
-def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings: Any) -> JobResult:
+def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings: Any) -> Result:
     """Tests a policy on drivers that it has not learned from, as `protocol=transfer` does.
 
     It is compared with the model's default parameters, with the pooled ones that it brings, and
@@ -203,13 +207,13 @@ def in_folder(policy: PolicyLike) -> Iterator[str]:
     Raises:
         DataError: there is no such policy.
     """
-    if isinstance(policy, JobResult) and policy.folder is not None:
+    if isinstance(policy, Result) and policy.folder is not None:
         policy = policy.folder
     if isinstance(policy, str | Path):
         folder_of(policy)  # says that it is not there
         yield str(policy)
         return
-    agent = policy.policy if isinstance(policy, JobResult) else policy
+    agent = policy.policy if isinstance(policy, Result) else policy
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary, IN_MEMORY)
         checkpoint.save_agent(agent, folder / "policy")

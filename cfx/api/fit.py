@@ -173,12 +173,12 @@ class Fit:
 
     def plot(self) -> Figure:
         """Draws the parameters between their bounds, and how they go together."""
-        from cfx.figures.figure import Results, drawn, parameter_axes
+        from cfx.results.result import Result, described_parameters
 
         tables = [self._of(one).add_prefix("parameter_").assign(method=one) for one in METHODS]
         rows = pd.concat(tables, ignore_index=True)
-        axes = parameter_axes(self._context.space.tuned)
-        return drawn("calibration", Results(rows, METHODS, axes))
+        described = {"parameters": described_parameters(self._context.space.tuned)}
+        return Result(data=described, tables={"pairs": rows}).plot("calibration")
 
     def _of(self, method: str) -> pd.DataFrame:
         """Returns a method's parameters, a row per pair."""
@@ -239,7 +239,7 @@ class Fit:
         )
 
     def _repr_html_(self) -> str:
-        from cfx.figures.figure import as_html
+        from cfx.figures.drawing import as_html
 
         return as_html(repr(self), self.summary())
 

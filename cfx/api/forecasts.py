@@ -60,7 +60,7 @@ class Forecast:
             pair_ids: which; None: the first three.
         """
         from cfx.api.figures import draw_fans
-        from cfx.figures.figure import for_notebooks
+        from cfx.figures.drawing import for_notebooks
 
         known = list(self.paths["pair_id"].unique())
         chosen = known[:3] if pair_ids is None else chosen_names(pair_ids, known, "the forecast")
@@ -71,7 +71,7 @@ class Forecast:
         return f"Forecast({pairs} pairs, {self.paths['path'].nunique()} paths each)"
 
     def _repr_html_(self) -> str:
-        from cfx.figures.figure import as_html
+        from cfx.figures.drawing import as_html
 
         return as_html(repr(self), self.quantiles())
 

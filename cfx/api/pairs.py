@@ -161,7 +161,7 @@ class Pairs:
             pair_ids: which; None: the first three.
         """
         from cfx.api.figures import draw_pairs
-        from cfx.figures.figure import for_notebooks
+        from cfx.figures.drawing import for_notebooks
 
         chosen = self.selected[:3] if pair_ids is None else self.select(pair_ids).selected
         return for_notebooks(draw_pairs(list(chosen)))
@@ -187,7 +187,7 @@ class Pairs:
         return f"; left out: {', '.join(reasons)}" if reasons else ""
 
     def _repr_html_(self) -> str:
-        from cfx.figures.figure import as_html
+        from cfx.figures.drawing import as_html
 
         return as_html(repr(self), self.summary)
 

@@ -57,12 +57,12 @@ from cfx.errors import (
 )
 
 if TYPE_CHECKING:
-    from cfx.app.job.results import JobResult
     from cfx.results.config import JobConfig
+    from cfx.results.result import Result
 
 log = logging.getLogger(__name__)
 
-RunJob = Callable[["JobConfig", Path], "JobResult"]
+RunJob = Callable[["JobConfig", Path], "Result"]
 """What runs a job; `cfx.app.job.run.run_job` unless a caller gives another."""
 
 INTERRUPTED, TERMINATED = 130, 143
@@ -245,7 +245,7 @@ def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
     return 0
 
 
-def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> JobResult:
+def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> Result:
     """Runs the job that `python -m cfx OVERRIDES` runs.
 
     It runs in this process, and writes into a new output folder. What belongs to the process is
@@ -282,7 +282,7 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
     return False
 
 
-def _run_job(values: Mapping[str, Any], folder: Path, run_job: RunJob | None) -> JobResult:
+def _run_job(values: Mapping[str, Any], folder: Path, run_job: RunJob | None) -> Result:
     """Runs a job; what a plugin raises is attributed to its distribution.
 
     Raises:

@@ -136,7 +136,7 @@ KINDS: dict[str, Kind] = {
 PARTS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
-        Kind("figure", "cfx.figures.figure:JobFigure", chosen=False),
+        Kind("figure", "cfx.results.figure:JobFigure", chosen=False),
         Kind("head", "cfx.policies.heads.base:ParameterHead", group="learner.head", chosen=False),
         Kind("export", "cfx.core.command:ExportFormat", chosen=False),
         Kind(

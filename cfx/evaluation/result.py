@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -23,6 +23,8 @@ from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import at_places, in_text, summaries, values_of, wide_table
 
 if TYPE_CHECKING:
+    from cfx.data.pairs import PairSet
+    from cfx.data.style import StyleResult
     from cfx.models.base import DrivingModel
     from cfx.policies.base import Policy
 
@@ -185,7 +187,13 @@ class Evaluation:
             it has learned from, in words by scope; empty if it did not.
         platoon: ten followers in a row behind a braking leader; None if no network is for any
             driver.
-        tables: further tables of the protocol, by name (`cfx.results.table`).
+        tables: further tables of the protocol, and those that the job adds, by name
+            (`cfx.results.table`): of `curves`, `labels`, `sites`, `slices`, `fits` and those of
+            plugins, what there is.
+        notes: what the protocol says of its design (`ProtocolResult.notes`).
+        recorded: the job's pairs, also those that were not tested; None: not known.
+        style: the driving style of their drivers; None: not known.
+        seed: of whatever is drawn from these results, such as the bootstrap of intervals.
     """
 
     about: pd.DataFrame
@@ -199,6 +207,10 @@ class Evaluation:
     outside: Mapping[str, str] = field(default_factory=dict)
     platoon: Platoon | None = None
     tables: Mapping[str, pd.DataFrame] = field(default_factory=dict)
+    notes: Mapping[str, Any] = field(default_factory=dict)
+    recorded: PairSet | None = None
+    style: StyleResult | None = None
+    seed: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:

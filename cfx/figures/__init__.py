@@ -1,5 +1,4 @@
-"""Figures: what a figure of a finished job is, and how all figures look.
+"""How figures look: `canvas.py` has fonts and paper, `text.py` the names of methods and units.
 
-`figure.py` says what a figure shows of the results and how it is written, `canvas.py` has fonts,
-paper and lines, `text.py` the names of methods and units, `job.py` reads a finished job's folder.
+`drawing.py` finds the figures that are installed, draws them in this look and writes them.
 """

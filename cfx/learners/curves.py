@@ -3,11 +3,20 @@
 from __future__ import annotations
 
 import logging
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 log = logging.getLogger(__name__)
+
+_TYPES = {"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float}
+
+
+def learning_curves(curves: pd.DataFrame) -> pd.DataFrame:
+    """Returns learning curves whose columns have the same types whether anything was learned."""
+    types: dict[str, Any] = _TYPES
+    return curves.astype(types)
 
 
 def over_networks(curves: pd.DataFrame, column: str) -> pd.DataFrame:

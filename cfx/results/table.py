@@ -4,15 +4,15 @@ A table is a class of its own: which columns it has, what its rows are made of, 
 which lines of the console summarise it. A distribution brings one by an entry point of the group
 `cfx.tables`, whose name becomes that of its file. Jobs write cfx's own tables, those of the plugins
 whose components they have, and those that they name into their folder and into MLflow; `cfx.load`,
-reports and figures (`Results.tables`) read them back.
+reports and figures (`Result.tables`) read them back.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import partial
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -25,6 +25,7 @@ import pyarrow.parquet as pq
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.distributions import ALL_OWN, OWN
+from cfx.core.files import atomic_write
 from cfx.core.job_folder import unreadable
 from cfx.core.memory import in_units, total_memory
 from cfx.errors import DataError, PluginError
@@ -33,9 +34,6 @@ if TYPE_CHECKING:
     from rich.console import RenderableType
     from rich.table import Table
 
-    from cfx.data.pairs import PairSet
-    from cfx.data.style import StyleResult
-    from cfx.evaluation.protocols.base import ProtocolResult
     from cfx.evaluation.result import Evaluation
 
 
@@ -62,28 +60,6 @@ class Column:
     def stands_for_several(self) -> bool:
         """Whether there is a column for each of something."""
         return any(part.isupper() and len(part) > 1 for part in self.name.split("_"))
-
-
-@dataclass(frozen=True)
-class Findings:
-    """What a job has found, of which its tables are made, and the job's seed."""
-
-    pairs: PairSet
-    style: StyleResult
-    protocol_result: ProtocolResult
-    seed: int = 0
-
-    @property
-    def evaluation(self) -> Evaluation:
-        """What was measured."""
-        return self.protocol_result.evaluation
-
-    @cached_property
-    def sites(self) -> pd.DataFrame | None:
-        """The evaluation by site, for a file, metrics and the console: see `site_table`."""
-        from cfx.evaluation.sites import site_table
-
-        return site_table(self.pairs, self.evaluation, seed=self.seed)
 
 
 class ResultTable(Component):
@@ -113,23 +89,33 @@ class ResultTable(Component):
     tracked: ClassVar[Literal["file", "table", ""]] = "file"
     large: ClassVar[bool] = False
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
         """Returns the rows of the table, in one part or in several that follow one another.
 
-        A table that its protocol delivers, under its name in `Evaluation.tables`, leaves this as it
+        A table that the job already has, under its name in `Evaluation.tables`, leaves this as it
         is and is not asked.
 
+        Args:
+            evaluation: what the job's protocol has measured.
+
         Returns:
-            Nothing, or None alone, where the job has found nothing of it.
+            Nothing, or None alone, where the job has measured nothing of it.
         """
         return ()
 
-    def metrics(self, findings: Findings) -> Mapping[str, float]:
+    def metrics(self, evaluation: Evaluation) -> Mapping[str, float]:
         """Returns metrics for `metrics.json` and MLflow; NaN where one is not defined."""
         return {}
 
-    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[RenderableType]:
-        """Returns what the job prints about it at its end; it fits 80 columns."""
+    def console(
+        self, evaluation: Evaluation, metrics: Mapping[str, float]
+    ) -> Iterable[RenderableType]:
+        """Returns what the job prints about it at its end; it fits 80 columns.
+
+        Args:
+            evaluation: what the job's protocol has measured.
+            metrics: of the job, under their MLflow names.
+        """
         return ()
 
     def write(self, path: Path, parts: Iterable[pd.DataFrame]) -> None:
@@ -178,46 +164,27 @@ class ResultTable(Component):
         return table
 
 
-@dataclass(frozen=True)
-class WrittenTable:
-    """A table that a job has written; its rows are None if it is `large`."""
+class Tables(Mapping[str, pd.DataFrame]):
+    """A job's tables by name; one that is not in memory is made, or read, when it is asked for."""
 
-    about: registry.Installed[ResultTable]
-    rows: pd.DataFrame | None
+    def __init__(self, sources: Mapping[str, pd.DataFrame | Callable[[], pd.DataFrame]]) -> None:
+        """Takes by name a table, or a function without arguments that returns it."""
+        self._sources = dict(sources)
 
-    @property
-    def file(self) -> str:
-        """The name of its file."""
-        return file_of(self.about)
+    def __getitem__(self, name: str) -> pd.DataFrame:
+        source = self._sources[name]
+        if not isinstance(source, pd.DataFrame):
+            source = self._sources[name] = source()
+        return source
 
-    def metrics(self, findings: Findings) -> Mapping[str, float]:
-        """Returns its metrics."""
-        return self.about.attempt(lambda table: table.metrics(findings), {})
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._sources)
 
-    def console(
-        self, findings: Findings, metrics: Mapping[str, float]
-    ) -> tuple[RenderableType, ...]:
-        """Returns what the job prints about it."""
-        return self.about.attempt(lambda table: tuple(table.console(findings, metrics)), ())
+    def __len__(self) -> int:
+        return len(self._sources)
 
-
-@dataclass(frozen=True)
-class Kept:
-    """What a job has written.
-
-    Attributes:
-        folder: of the job, with its policy in `policy/`.
-        metrics: of the job, under their MLflow names.
-        tables: those that it has.
-        figures: image files.
-        files: others that MLflow keeps too.
-    """
-
-    folder: Path
-    metrics: dict[str, float]
-    tables: Sequence[WrittenTable]
-    figures: Sequence[Path]
-    files: Sequence[Path]
+    def __contains__(self, name: object) -> bool:
+        return name in self._sources  # the inherited method would read the table
 
 
 def installed() -> tuple[registry.Installed[ResultTable], ...]:
@@ -244,20 +211,20 @@ def chosen_tables(
     for name in names - {ALL_OWN}:
         registry.get("table", name)
     tables = []
-    for one in installed():
-        is_own = one.distribution == OWN or one.distribution in plugins
-        if one.name in names or (ALL_OWN in names and is_own):
-            tables.append(one)
+    for table in installed():
+        is_own = table.distribution == OWN or table.distribution in plugins
+        if table.name in names or (ALL_OWN in names and is_own):
+            tables.append(table)
     return tuple(tables)
 
 
-def file_of(one: registry.Installed[ResultTable]) -> str:
+def file_of(table: registry.Installed[ResultTable]) -> str:
     """Returns the name of a table's file."""
-    return one.name + one.part.suffix
+    return table.name + table.part.suffix
 
 
 def parts_of(
-    one: registry.Installed[ResultTable], findings: Findings
+    table: registry.Installed[ResultTable], evaluation: Evaluation
 ) -> Iterator[pd.DataFrame] | None:
     """Returns the rows of a table, some after the other; None where a job has none.
 
@@ -265,19 +232,72 @@ def parts_of(
         PluginError: the rows lack a column that is declared.
     """
 
-    def begun(table: ResultTable) -> Iterator[pd.DataFrame] | None:
-        delivered = findings.evaluation.tables.get(one.name)
-        found = table.rows(findings) if delivered is None else [delivered]
-        rows = (part for part in found if part is not None)
-        first = next(rows, None)
+    def begun(component: ResultTable) -> Iterator[pd.DataFrame] | None:
+        rows: Iterator[pd.DataFrame | None] = iter([evaluation.tables.get(table.name)])
+        if table.name not in evaluation.tables:
+            rows = iter(component.rows(evaluation))
+        parts = (part for part in rows if part is not None)
+        first = next(parts, None)
         if first is None:
             return None
-        for column in table.columns:
+        for column in component.columns:
             if column.required and not column.stands_for_several and column.name not in first:
                 raise PluginError(f"it declares the column '{column.name}', its rows have none")
-        return chain([first], rows)
+        return chain([first], parts)
 
-    return one.attempt(begun, None)
+    return table.attempt(begun, None)
+
+
+def tables_of(
+    evaluation: Evaluation,
+    chosen: Sequence[registry.Installed[ResultTable]],
+    folder: Path | None = None,
+) -> tuple[Tables, dict[str, float]]:
+    """Returns the chosen tables of an evaluation, and their metrics.
+
+    Those that an earlier job left in the folder go, if one is given; these are written there.
+
+    Raises:
+        OSError: a file cannot be written.
+    """
+    sources: dict[str, pd.DataFrame | Callable[[], pd.DataFrame]] = {}
+    metrics: dict[str, float] = {}
+    names = {table.name for table in chosen}  # installing something makes the tables anew
+    for table in installed():
+        parts = parts_of(table, evaluation) if table.name in names else None
+        path = None if folder is None else folder / file_of(table)
+        if parts is None:
+            if path is not None:
+                path.unlink(missing_ok=True)
+            continue
+        if not table.part.large:
+            rows = pd.concat(list(parts))
+            sources[table.name] = rows
+            parts = iter([rows])
+        elif path is None:
+            sources[table.name] = partial(_together, table, evaluation)
+        else:
+            sources[table.name] = partial(table.part.read, path)
+        if path is not None:
+            with atomic_write(path) as temporary:
+                table.part.write(temporary, parts)
+    for table in installed():
+        if table.name in sources:
+            metrics |= _metrics_of(table, evaluation)
+    return Tables(sources), metrics
+
+
+def _metrics_of(
+    table: registry.Installed[ResultTable], evaluation: Evaluation
+) -> Mapping[str, float]:
+    """Returns the metrics of a table; none where a plugin's fails."""
+    nothing: Mapping[str, float] = {}
+    return table.attempt(lambda component: component.metrics(evaluation), nothing)
+
+
+def _together(table: registry.Installed[ResultTable], evaluation: Evaluation) -> pd.DataFrame:
+    """Returns all rows of a large table."""
+    return pd.concat(list(parts_of(table, evaluation) or ()))
 
 
 def metrics_table(
@@ -305,18 +325,17 @@ def metrics_table(
     return table
 
 
-def read_tables(folder: Path, *names: str) -> dict[str, pd.DataFrame]:
-    """Reads the tables of a finished job's folder, all or some; what is not there is left out.
+def stored_tables(folder: Path) -> Tables:
+    """Returns the tables of a finished job's folder, each of which is read when it is asked for.
 
-    Raises:
-        DataError: a file cannot be read, or is not what a job writes.
+    Reading one raises a DataError if its file cannot be read, or is not what a job writes.
     """
-    found = {}
-    for one in installed():
-        path = folder / file_of(one)
-        if (not names or one.name in names) and path.exists():
-            found[one.name] = one.part.read(path)
-    return found
+    sources: dict[str, pd.DataFrame | Callable[[], pd.DataFrame]] = {}
+    for table in installed():
+        path = folder / file_of(table)
+        if path.exists():
+            sources[table.name] = partial(table.part.read, path)
+    return Tables(sources)
 
 
 def _load(path: Path, texts: list[str]) -> pd.DataFrame:

@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import pandas as pd
 from rich.console import RenderableType
@@ -27,12 +26,12 @@ from cfx.calibration.settings import (
 )
 from cfx.core.parameters import Parameter
 from cfx.data.style import INDICATORS, style_distances, styles_by_site
-from cfx.evaluation.result import METHODS
+from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.sites import ALL_SITES, BASELINES
 from cfx.evaluation.tables import scope_label
 from cfx.learners.curves import best_losses
 from cfx.policies.context import LEVEL as EXPECTED_LEVEL
-from cfx.results.table import Column, Findings, ResultTable
+from cfx.results.table import Column, ResultTable
 
 PAIR = Column("pair_id", "", "the pair of leader and follower", "text")
 DRIVER = Column("driver", "", "the follower of the pair", "text")
@@ -78,11 +77,10 @@ class Pairs(ResultTable):
         Column("forecast_METRIC", "as of the metric", "an error of the pair's forecasts"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.evaluation.table]
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
+        return [evaluation.table]
 
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        evaluation = findings.evaluation
+    def metrics(self, evaluation: Evaluation) -> dict[str, float]:
         shares = flat_for(evaluation.table, evaluation.names)
         return {f"flat/{name}": share for name, share in shares.items()}
 
@@ -102,8 +100,8 @@ class PairMetrics(ResultTable):
         Column("value", "as of the metric", "NaN where it is not defined"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return findings.evaluation.values_tables()
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
+        return evaluation.values_tables()
 
 
 class Trajectories(ResultTable):
@@ -127,8 +125,8 @@ class Trajectories(ResultTable):
         Column("NAME_METHOD", "as of the parameter", "a tuned parameter that held at the frame"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return findings.evaluation.trajectories_tables()
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
+        return evaluation.trajectories_tables()
 
 
 class Curves(ResultTable):
@@ -148,18 +146,8 @@ class Curves(ResultTable):
         Column("sampled_paths", "1", "paths per window in the CRPS", "int", required=False),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        # The same types whether anything was learned or not.
-        types: dict[str, Any] = {
-            "network": str,
-            "epoch": "int64",
-            "train_loss": float,
-            "validation_loss": float,
-        }
-        return [findings.protocol_result.curves.astype(types)]
-
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        return best_losses(findings.protocol_result.curves)
+    def metrics(self, evaluation: Evaluation) -> dict[str, float]:
+        return best_losses(evaluation.tables["curves"])
 
 
 class Style(ResultTable):
@@ -181,8 +169,8 @@ class Style(ResultTable):
         Column("driver_type", "", "what drives", "text", required=False),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.style.table]
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
+        return [] if evaluation.style is None else [evaluation.style.table]
 
 
 class Labels(ResultTable):
@@ -201,15 +189,6 @@ class Labels(ResultTable):
         Column("diverged", "1", "whether the simulation diverged", "bool", required=False),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        labels = findings.protocol_result.labels
-        if labels is not None:
-            yield labels.to_frame(findings.pairs, findings.evaluation.names)
-
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        labels = findings.protocol_result.labels
-        return {} if labels is None else labels.metrics()
-
 
 class Platoon(ResultTable):
     """Followers in a row behind a leader that brakes, a row per method, network and frame."""
@@ -225,12 +204,12 @@ class Platoon(ResultTable):
         Column("gap", "m", "simulated; NaN for the leader"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        platoon = findings.evaluation.platoon
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
+        platoon = evaluation.platoon
         return [None if platoon is None else platoon.table]
 
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        platoon = findings.evaluation.platoon
+    def metrics(self, evaluation: Evaluation) -> dict[str, float]:
+        platoon = evaluation.platoon
         return {} if platoon is None else platoon.metrics()
 
 
@@ -250,8 +229,8 @@ class History(ResultTable):
         Column("improvement", "1", "over the driver's own fixed parameters"),
     )
 
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        return history_metrics(findings.evaluation.tables["history"])
+    def metrics(self, evaluation: Evaluation) -> dict[str, float]:
+        return history_metrics(evaluation.tables["history"])
 
 
 class Slices(ResultTable):
@@ -289,9 +268,8 @@ class KnownParameters:
     parameters: tuple[Parameter, ...]
 
     @classmethod
-    def of(cls, findings: Findings) -> KnownParameters | None:
+    def of(cls, evaluation: Evaluation) -> KnownParameters | None:
         """Returns them; None where the job asked for no posterior."""
-        evaluation = findings.evaluation
         fits = evaluation.tables.get("fits")
         if fits is None or "noise_scale" not in fits:
             return None
@@ -441,12 +419,14 @@ class Fits(ResultTable):
         Column("divergences", "1", "share of draws: above 0.01 the same (`nuts`)", required=False),
     )
 
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        known = KnownParameters.of(findings)
+    def metrics(self, evaluation: Evaluation) -> dict[str, float]:
+        known = KnownParameters.of(evaluation)
         return {} if known is None else known.metrics()
 
-    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[RenderableType]:
-        known = KnownParameters.of(findings)
+    def console(
+        self, evaluation: Evaluation, metrics: Mapping[str, float]
+    ) -> Iterable[RenderableType]:
+        known = KnownParameters.of(evaluation)
         return [] if known is None else known.printed()
 
 
@@ -485,10 +465,7 @@ class Sites(ResultTable):
         Column("over_BASELINE_high", "1", "its upper end"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [findings.sites]
-
-    def metrics(self, findings: Findings) -> Mapping[str, float]:
+    def metrics(self, evaluation: Evaluation) -> Mapping[str, float]:
         columns = {}
         for method in METHODS:
             for metric in ("rmse_speed", "rmse_gap"):
@@ -496,9 +473,7 @@ class Sites(ResultTable):
         for baseline in BASELINES:
             columns[f"over_{baseline}"] = f"rmse_improvement/{baseline}"
         found: dict[str, float] = {}
-        table = findings.sites
-        if table is None:
-            return found
+        table = evaluation.tables["sites"]
         for _, row in table[table["driver_type"] == ALL_SITES].iterrows():
             site = re.sub(r"[^\w.\- ]", "_", str(row["site"]))
             part = "" if row["scope"] == "test" else "full_trajectory/"
@@ -506,10 +481,9 @@ class Sites(ResultTable):
                 found[f"{part}site/{site}/{columns[column]}"] = float(row[column])
         return found
 
-    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
-        if findings.sites is not None:
-            for scope, rows in findings.sites.groupby("scope", sort=False):
-                yield _sites_printed(rows, scope_label(str(scope)))
+    def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[Table]:
+        for scope, rows in evaluation.tables["sites"].groupby("scope", sort=False):
+            yield _sites_printed(rows, scope_label(str(scope)))
 
 
 def _sites_printed(rows: pd.DataFrame, scope: str) -> Table:
@@ -559,8 +533,8 @@ class SiteStyles(ResultTable):
         *(Column(one.name, one.unit, "median of an indicator") for one in INDICATORS),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [styles_by_site(findings.style)]
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
+        return [] if evaluation.style is None else [styles_by_site(evaluation.style)]
 
 
 class StyleDistances(ResultTable):
@@ -583,8 +557,8 @@ class StyleDistances(ResultTable):
         ),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        return [style_distances(findings.style)]
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
+        return [] if evaluation.style is None else [style_distances(evaluation.style)]
 
 
 _UNLIKE = 3.0
@@ -633,8 +607,8 @@ class Past(ResultTable):
         Column("unlike_in", "", "which driver feature that is", "text", required=False),
     )
 
-    def metrics(self, findings: Findings) -> Mapping[str, float]:
-        table = findings.evaluation.tables["past"]
+    def metrics(self, evaluation: Evaluation) -> Mapping[str, float]:
+        table = evaluation.tables["past"]
         found = {
             "past/share": float(table["share"].mean()),
             "past/rmse_speed/alone": float(table["rmse_speed_alone"].mean()),
@@ -650,9 +624,9 @@ class Past(ResultTable):
             found["past/unlike"] = float((table["unlike"].dropna() > _UNLIKE).mean())
         return found
 
-    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[str]:
+    def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[str]:
         """Returns how the two drove together, what error to expect, and a warning."""
-        table = findings.evaluation.tables["past"]
+        table = evaluation.tables["past"]
         if float(table["share"].min()) < 1:
             yield (
                 "The policy drives beside each driver's own parameters, with a share of"

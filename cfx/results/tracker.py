@@ -17,7 +17,7 @@ from cfx.policies.ready import folder_of_ready_made, is_ready_made
 
 if TYPE_CHECKING:
     from cfx.results.config import JobConfig
-    from cfx.results.table import Findings, Kept
+    from cfx.results.result import Result
 
 log = logging.getLogger(__name__)
 
@@ -33,8 +33,8 @@ class Tracker:
     def set_tags(self, tags: Mapping[str, str]) -> None:
         """Adds tags to the run."""
 
-    def log_job(self, findings: Findings, kept: Kept, description: str) -> None:
-        """Logs what a job has found and written; `description`, in Markdown, is for its page."""
+    def log_job(self, result: Result, description: str) -> None:
+        """Logs a job that is written; `description`, in Markdown, is for its page."""
 
     def how_to_open(self) -> tuple[str, ...]:
         """Returns lines that tell a user where to look."""

@@ -16,7 +16,7 @@ import cfx
 from cfx.app.overrides import override
 from cfx.calibration.calibrator import Calibrator
 from cfx.errors import CfxError, ConfigError, DataError, ParameterError
-from cfx.results.table import read_tables
+from cfx.results.table import stored_tables
 from tests.checkout import needs
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 256}
@@ -62,7 +62,7 @@ def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Calibrator, "fixed", recorded)
         cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
-    return Job(found[0], read_tables(folder, "fits")["fits"])
+    return Job(found[0], stored_tables(folder)["fits"])
 
 
 def test_parameters_are_those_of_the_command_to_the_last_bit(fit: cfx.Fit, job: Job) -> None:

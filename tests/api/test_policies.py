@@ -43,7 +43,7 @@ def others() -> cfx.Pairs:
 
 
 @pytest.fixture(scope="module")
-def trained(pairs: cfx.Pairs) -> cfx.JobResult:
+def trained(pairs: cfx.Pairs) -> cfx.plugin.Result:
     return cfx.train(pairs, "idm", for_="unseen_drivers", seed=2, **SMALL)
 
 
@@ -54,19 +54,20 @@ def same_metrics(one: dict[str, float], other: dict[str, float]) -> bool:
     return all(other[k] == v or (math.isnan(v) and math.isnan(other[k])) for k, v in one.items())
 
 
-def run(result: cfx.JobResult, folder: Path) -> cfx.JobResult:
+def run(result: cfx.plugin.Result, folder: Path) -> cfx.plugin.Result:
     """Runs the command of a result."""
-    return cfx.run([*shlex.split(result.command)[3:], *QUIET, f"hydra.run.dir={folder}"])
+    command = cfx.from_config(result).command
+    return cfx.run([*shlex.split(command)[3:], *QUIET, f"hydra.run.dir={folder}"])
 
 
 def test_training_is_that_of_the_command_to_the_last_bit(
-    trained: cfx.JobResult, tmp_path: Path
+    trained: cfx.plugin.Result, tmp_path: Path
 ) -> None:
-    assert "experiment=unseen_drivers" in trained.command
+    assert "experiment=unseen_drivers" in cfx.from_config(trained).command
     assert same_metrics(trained.metrics, run(trained, tmp_path / "out").metrics)
 
 
-def test_a_result_says_how_much_the_policy_improves(trained: cfx.JobResult) -> None:
+def test_a_result_says_how_much_the_policy_improves(trained: cfx.plugin.Result) -> None:
     found = trained.improvement(over="population")
     assert found["mean"] == trained.metrics["rmse_improvement/population/mean"]
     assert found["ci95_low"] <= found["mean"] <= found["ci95_high"]
@@ -77,13 +78,21 @@ def test_a_result_says_how_much_the_policy_improves(trained: cfx.JobResult) -> N
 
 
 def test_a_result_is_saved_loaded_tested_and_drawn(
-    trained: cfx.JobResult, others: cfx.Pairs, tmp_path: Path
+    trained: cfx.plugin.Result, others: cfx.Pairs, tmp_path: Path
 ) -> None:
     saved = trained.save(tmp_path / "mine")
     again = cfx.load(saved.folder)
     assert same_metrics(trained.metrics, again.metrics)
-    assert again.command == trained.command
-    assert cfx.from_config(tmp_path / "mine").config == trained.config
+    assert again.config == trained.config
+    assert again.data == trained.data
+    assert set(again.tables) == set(trained.tables)
+    for name, table in trained.tables.items():
+        pd.testing.assert_frame_equal(
+            again.tables[name], table, check_dtype=False, check_exact=True
+        )
+    assert again.improvements == trained.improvements
+    experiment = cfx.from_config(tmp_path / "mine")
+    assert experiment.command == cfx.from_config(trained).command
     for result in (trained, again):
         assert vars(result.plot("drives"))["_repr_png_"]().startswith(b"\x89PNG")
     with pytest.raises(DataError, match="Did you mean 'drives'"):
@@ -95,10 +104,12 @@ def test_a_result_is_saved_loaded_tested_and_drawn(
     assert same_metrics(tested.metrics, in_memory.metrics)
     assert same_metrics(tested.metrics, run(tested, tmp_path / "out").metrics)
     with pytest.raises(DataError, match="save it first"):
-        _ = in_memory.command
+        _ = cfx.from_config(in_memory).command
 
 
-def test_pairs_that_were_learned_from_are_refused(trained: cfx.JobResult, pairs: cfx.Pairs) -> None:
+def test_pairs_that_were_learned_from_are_refused(
+    trained: cfx.plugin.Result, pairs: cfx.Pairs
+) -> None:
     with pytest.raises(DataError, match="has learned from 4 of the 4 pairs"):
         cfx.evaluate(trained, pairs)
     with pytest.raises(DataError, match="has learned from 4 of the 4 pairs"):

@@ -15,12 +15,14 @@ from pathlib import Path
 import pytest
 from matplotlib.figure import Figure
 
-import cfx.app.job.results
 import cfx.calibration.cache
 import cfx.core.files
 import cfx.data.tidy
-import cfx.figures.figure
+import cfx.figures.drawing
 import cfx.policies.checkpoint
+import cfx.results.folder
+import cfx.results.result
+import cfx.results.table
 from cfx.app import cli
 from cfx.errors import Terminated
 from tests.broken_plugins import QUICK
@@ -33,8 +35,10 @@ MODULES = (
     cfx.calibration.cache,
     cfx.data.tidy,
     cfx.core.files,
-    cfx.app.job.results,
-    cfx.figures.figure,
+    cfx.results.folder,
+    cfx.results.result,
+    cfx.results.table,
+    cfx.figures.drawing,
 )
 """Whoever writes files."""
 
@@ -87,7 +91,7 @@ def unrendered(figure: Figure, file: Path, **options: object) -> None:
 
 def job(folder: Path, faults: Faults, monkeypatch: pytest.MonkeyPatch) -> int:
     with monkeypatch.context() as patched:
-        patched.setattr(cfx.figures.figure, "draw_figure", undrawn)
+        patched.setattr(cfx.figures.drawing, "draw_figure", undrawn)
         patched.setattr(Figure, "savefig", unrendered)
         for module in MODULES:
             patched.setattr(module, "atomic_write", faults.atomic_write)

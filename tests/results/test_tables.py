@@ -10,20 +10,19 @@ import pytest
 
 from cfx.core import registry
 from cfx.errors import DataError
+from cfx.evaluation.result import Evaluation
 from cfx.results.table import (
     Column,
-    Findings,
     ResultTable,
     chosen_tables,
     file_of,
     installed,
     parts_of,
-    read_tables,
+    stored_tables,
 )
 from cfx.results.tables import History
 from tests.checkout import ROOT
 from tests.made_up import GAINS, make_history, make_results
-from tests.test_job_results import findings as found
 
 
 class Census(ResultTable):
@@ -38,9 +37,9 @@ CENSUS: registry.Installed[ResultTable] = registry.Installed(
 )
 
 
-def findings(**tables: pd.DataFrame) -> Findings:
+def measured(**tables: pd.DataFrame) -> Evaluation:
     evaluation = make_results(pairs=2, frames=5).evaluation
-    return found(dataclasses.replace(evaluation, tables=tables))
+    return dataclasses.replace(evaluation, tables=tables)
 
 
 def test_the_list_of_files_says_what_each_table_holds() -> None:
@@ -70,8 +69,8 @@ def test_a_job_writes_own_tables_those_of_its_plugins_and_those_it_names(
 
 
 def test_a_table_that_a_protocol_delivers_is_written_and_read_back(tmp_path: Path) -> None:
-    assert parts_of(CENSUS, findings()) is None
-    parts = parts_of(CENSUS, findings(census=pd.DataFrame({"drivers": [3]})))
+    assert parts_of(CENSUS, measured()) is None
+    parts = parts_of(CENSUS, measured(census=pd.DataFrame({"drivers": [3]})))
     assert parts is not None
     assert file_of(CENSUS) == "census.parquet"
     CENSUS.part.write(tmp_path / "census.parquet", parts)
@@ -81,7 +80,7 @@ def test_a_table_that_a_protocol_delivers_is_written_and_read_back(tmp_path: Pat
 def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
     history = make_history(evaluation.trajectories, GAINS)
-    assert History().metrics(findings(history=history)) == {
+    assert History().metrics(measured(history=history)) == {
         "history/own/0s/rmse_improvement": pytest.approx(-0.1),
         "history/own/10s/rmse_improvement": pytest.approx(0.1),
         "history/own/80pct/rmse_improvement": pytest.approx(0.2),
@@ -90,7 +89,7 @@ def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:
 
 
 def test_a_table_of_others_that_fails_is_left_out(caplog: pytest.LogCaptureFixture) -> None:
-    assert parts_of(CENSUS, findings(census=pd.DataFrame({"heads": [3]}))) is None
+    assert parts_of(CENSUS, measured(census=pd.DataFrame({"heads": [3]}))) is None
     assert "table census of the distribution cfx-census is left out" in caplog.text
     assert "declares the column 'drivers'" in caplog.text
 
@@ -98,7 +97,7 @@ def test_a_table_of_others_that_fails_is_left_out(caplog: pytest.LogCaptureFixtu
 def test_an_own_table_that_fails_ends_the_job() -> None:
     own = dataclasses.replace(CENSUS, distribution="cfx-driving")
     with pytest.raises(Exception, match="declares the column 'drivers'"):
-        parts_of(own, findings(census=pd.DataFrame({"heads": [3]})))
+        parts_of(own, measured(census=pd.DataFrame({"heads": [3]})))
 
 
 def test_a_damaged_table_is_one_sentence(tmp_path: Path) -> None:
@@ -106,4 +105,4 @@ def test_a_damaged_table_is_one_sentence(tmp_path: Path) -> None:
         tmp_path / "style.csv", index=False
     )
     with pytest.raises(DataError, match=r"style\.csv is damaged: column 'score' holds something"):
-        read_tables(tmp_path)
+        _ = stored_tables(tmp_path)["style"]

@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,7 +23,6 @@ from cfx.core import registry
 from cfx.data.tidy import write_tidy
 from cfx.errors import TrackingError
 from cfx.evaluation.headline import headline
-from cfx.evaluation.protocols.base import ProtocolResult
 from cfx.evaluation.result import Purpose
 from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
@@ -35,8 +35,7 @@ from cfx.results import provenance
 from cfx.results.config import JobConfig
 from cfx.results.mlflow.store import download_run, quiet, translate_errors
 from cfx.results.mlflow.tracker import CURVE_POINTS, MlflowTracker, sweep_link
-from cfx.results.table import Findings, Kept, ResultTable, WrittenTable
-from cfx.results.tables import Pairs
+from cfx.results.result import Result
 from cfx.results.tracker import tracked
 from cfx.simulation.windows import WindowSettings
 from tests.drives import wavy_pairs
@@ -103,22 +102,19 @@ def log_job(
     figures: Sequence[Path] = (),
 ) -> None:
     """Logs made-up results, with a policy that is not theirs."""
-    result = ProtocolResult(made.evaluation, saved.policy, made.curves, None)
-    pairs: registry.Installed[ResultTable] = registry.Installed(
-        "table", "pairs", Pairs(), "cfx-driving"
+    folder = saved.folder.parent
+    made.evaluation.table.to_csv(folder / "pairs.csv")
+    for name in ("config.yaml", "metrics.json", "data.json"):
+        (folder / name).touch()
+    evaluation = replace(made.evaluation, tables={"curves": made.curves}, recorded=saved.pairs)
+    result = replace(
+        Result.of(evaluation),
+        tables={"pairs": made.evaluation.table},
+        folder=folder,
+        figures=tuple(figures),
+        demo=files,
     )
-    made.evaluation.table.to_csv(saved.folder.parent / "pairs.csv")
-    run.log_job(
-        Findings(saved.pairs, made.style, result),
-        Kept(
-            saved.folder.parent,
-            made.evaluation.metrics(),
-            [WrittenTable(pairs, made.evaluation.table)],
-            figures,
-            files,
-        ),
-        "**What** it is.",
-    )
+    run.log_job(result, "**What** it is.")
 
 
 def table_of(client: Any, run_id: str) -> pd.DataFrame:
@@ -139,7 +135,6 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
     uri: str, client: Any, tmp_path: Path, saved_policy: SimpleNamespace
 ) -> None:
     results = make_results(pairs=4, frames=20)
-    (tmp_path / "metrics.json").write_text("{}")
     (tmp_path / "drives.png").write_bytes(b"png")
     with tracked(config_of(uri), tmp_path / "job") as run:
         assert client.get_run(run.run_id).info.status == "RUNNING"
@@ -148,7 +143,6 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
             run,
             results,
             saved_policy,
-            tmp_path / "metrics.json",
             figures=[tmp_path / "drives.png"],
         )
     kept = client.get_run(run.run_id)
@@ -173,6 +167,8 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
     assert {file.path for file in client.list_artifacts(run.run_id)} == {
         "figures",
         "metrics.json",
+        "config.yaml",
+        "data.json",
         "pairs.csv",
         "pairs.json",
         "policy",
@@ -217,7 +213,9 @@ def test_tracking_can_be_off(tmp_path: Path, saved_policy: SimpleNamespace) -> N
         run.set_tags({"a": "b"})
         log_job(run, make_results(pairs=1, frames=10), saved_policy)
     assert (run.run_id, run.how_to_open()) == ("", ())
-    assert names_in(tmp_path) == sorted([*before, "pairs.csv"])
+    assert names_in(tmp_path) == sorted(
+        [*before, "config.yaml", "data.json", "metrics.json", "pairs.csv"]
+    )
 
 
 @pytest.mark.parametrize(

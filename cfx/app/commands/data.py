@@ -53,8 +53,6 @@ def _describe(options: argparse.Namespace) -> None:
             `--style` has nothing to compare.
         DataError: a file cannot be used; or a pair stands in two of those that are compared.
     """
-    import pandas as pd
-
     from cfx.data.base import joined
     from cfx.data.describe import describe, describe_sites, describe_style
     from cfx.data.sites import with_sites, with_vehicles
@@ -100,11 +98,12 @@ def _describe(options: argparse.Namespace) -> None:
         distances = style_distances(style)
         print(f"\n{describe_style(style, distances)}")
         if figure is not None:
-            from cfx.figures.figure import Results, drawn, write_figure
+            from cfx.figures.drawing import drawn, write_figure
+            from cfx.results.result import Result
 
             tables = {} if distances is None else {"style_distances": distances}
-            results = Results(pd.DataFrame(), (), (), style=style, tables=tables)
-            write_figure(drawn("site_styles", results), figure)
+            result = Result(tables={"style": style.table, **tables})
+            write_figure(drawn("site_styles", result), figure)
             print(f"\nFigure: {figure}")
 
 

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pandas as pd
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.markup import escape
 from rich.table import Table
 
 from cfx.calibration.identifiability import NEARLY_BEST, flat_for
+from cfx.core.registry import Installed
 from cfx.errors import without_passwords
 from cfx.evaluation.demo import DEMO_PAGE
 from cfx.evaluation.headline import headline
@@ -22,22 +23,17 @@ from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import scope_label
 from cfx.figures.text import few_drivers, short_label
-from cfx.results.config import JobConfig
-from cfx.results.table import Findings, WrittenTable
+from cfx.results.result import Result
+from cfx.results.table import ResultTable, installed
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
     from cfx.results.tracker import Tracker
 
 
-def report(
-    findings: Findings,
-    metrics: Mapping[str, float],
-    tables: Sequence[WrittenTable],
-    console: Console,
-) -> None:
+def report(result: Result, console: Console) -> None:
     """Prints what was measured."""
-    evaluation = findings.evaluation
+    evaluation, metrics = result.evaluation, result.metrics
     console.print(methods_table(evaluation, metrics))
     if "full_trajectory" in evaluation.improvements:
         console.print(methods_table(evaluation, metrics, "full_trajectory"))
@@ -55,19 +51,29 @@ def report(
         _, words = headline(metrics)
         sentences += [f"In short: {words}."] if words else []
     _say(sentences, console)
-    for table in tables:
-        for printed in table.console(findings, metrics):
-            console.print(printed)
+    for table in installed():
+        if table.name in result.tables:
+            for printed in _printed(table, evaluation, metrics):
+                console.print(printed)
     sentences = _safety(evaluation, metrics)
     for scope, words in evaluation.outside.items():
         sentences.append(
             f"Policy, {scope_label(scope)}: {words}; there it fades towards its base parameters."
         )
-    for one in evaluation.left_out:
+    for metric in evaluation.left_out:
         sentences.append(
-            f"Not measured: {one.name} of the distribution {one.distribution} ({one.reason})."
+            f"Not measured: {metric.name} of the distribution {metric.distribution}"
+            f" ({metric.reason})."
         )
     _say(sentences, console)
+
+
+def _printed(
+    table: Installed[ResultTable], evaluation: Evaluation, metrics: Mapping[str, float]
+) -> tuple[RenderableType, ...]:
+    """Returns what is printed about a table; nothing where a plugin's fails."""
+    nothing: tuple[RenderableType, ...] = ()
+    return table.attempt(lambda component: tuple(component.console(evaluation, metrics)), nothing)
 
 
 def report_places(
@@ -237,26 +243,27 @@ def _methods_above(
     return ", ".join(found)
 
 
-def described(config: JobConfig, findings: Findings, metrics: Mapping[str, float]) -> str:
+def described(result: Result) -> str:
     """Returns what the job is, its result, its recordings, and the command that was typed."""
-    pairs = findings.pairs
+    pairs = result.evaluation.recorded
+    assert pairs is not None
     chosen = []
     for group in ("model", "policy", "learner", "optimizer", "objective", "protocol"):
-        if group == "learner" and findings.evaluation.purpose is Purpose.CALIBRATION:
+        if group == "learner" and result.purpose is Purpose.CALIBRATION:
             continue
-        chosen.append(f"{group} **{getattr(config, group)['name']}**")
+        chosen.append(f"{group} **{result.setting(f'{group}.name')}**")
     drivers = len({pair.driver for pair in pairs})
-    _, result = headline(metrics)
+    _, words = headline(result.metrics)
     source = Path(pairs.source).name
     lines = [
-        f"{result[:1].upper()}{result[1:]}.",
+        f"{words[:1].upper()}{words[1:]}.",
         "",
         ", ".join(chosen) + ".",
         "",
-        f"{len(pairs)} pairs of {drivers} drivers from {source} (data **{config.data['name']}**),"
-        f" in steps of {pairs.dt:g} s; seed {config.seed}.",
+        f"{len(pairs)} pairs of {drivers} drivers from {source} (data"
+        f" **{result.component('data')}**), in steps of {pairs.dt:g} s; seed {result.seed}.",
     ]
-    typed = [without_passwords(one) for one in sys.argv[1:]]
+    typed = [without_passwords(argument) for argument in sys.argv[1:]]
     if typed and Path(sys.argv[0]).name in {"cfx", "__main__.py"}:
         lines += ["", "```", f"cfx {' '.join(typed)}", "```"]
     return "\n".join(lines)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
@@ -14,14 +16,14 @@ from cfx.results.config import JobConfig
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from cfx.app.job.results import JobResult
     from cfx.data.base import Dataset
     from cfx.data.pairs import PairSet
+    from cfx.results.result import Result
 
 log = logging.getLogger(__name__)
 
 
-def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> JobResult:
+def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> Result:
     """Runs one job and writes its results into `folder`, which is made if it is not there.
 
     Raises:
@@ -35,16 +37,17 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     # These take seconds to import: a wrong path or column has been answered by now.
     from rich.console import Console
 
-    from cfx.app.job import results, steps
+    from cfx.app.job import steps
     from cfx.app.job.console import described, report, report_places
+    from cfx.results.folder import Upload, begin
     from cfx.results.tracker import tracked
 
     raise_if_signalled()  # imports swallow Ctrl-C
     data = config.data
     console = console or Console()
     config, parts = steps.prepare(config)
-    results.begin(folder, config)
-    upload = None if config.output.url is None else results.Upload(config.output.url, folder)
+    begin(folder, config)
+    upload = None if config.output.url is None else Upload(config.output.url, folder)
     with tracked(config, folder) as tracker:
         if config.data != data:  # the protocol has determined other data
             pairs = load_pairs(parts.dataset)
@@ -58,48 +61,25 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
                 "dataset.pairs": str(len(pairs)),
             }
         )
-        context = steps.compose(config, parts, pairs, style)
-        findings = steps.find(context, parts, config.calibration)
+        result = steps.find(steps.compose(config, parts, pairs, style), parts, config)
         # Figures take seconds: the numbers are there before them.
-        kept = results.write_job(
-            folder,
-            config,
-            parts,
-            findings,
-            tell=lambda metrics, tables: report(findings, metrics, tables, console),
-        )
+        result = result.write(folder, config, tell=partial(report, console=console))
         # After the folder, so that no failure of MLflow loses it.
-        tracker.log_job(findings, kept, described(config, findings, kept.metrics))
+        tracker.log_job(result, described(result))
         if upload is not None:
             upload.finish()
             tracker.set_tags({"cfx.output_url": upload.url})
-    report_places(kept.folder, console, tracker, None if upload is None else upload.url)
-    return results.JobResult(
-        metrics=kept.metrics,
-        pairs=findings.evaluation.table,
-        policy=findings.protocol_result.policy,
-        figures=tuple(kept.figures),
-        folder=folder,
-        run_id=tracker.run_id,
-        computed=results.Computed(config, parts, findings),
-    )
+    report_places(folder, console, tracker, None if upload is None else upload.url)
+    return replace(result, run_id=tracker.run_id)
 
 
-def compute(config: JobConfig, pairs: PairSet) -> JobResult:
+def compute(config: JobConfig, pairs: PairSet) -> Result:
     """Runs a job on pairs that are read already; writes nothing, caches nothing, tracks nothing.
 
     Raises:
         CfxError: as `run_job`.
     """
-    from cfx.app.job import results, steps
+    from cfx.app.job import steps
 
     config, parts, context = steps.without_files(config, pairs)
-    findings = steps.find(context, parts, config.calibration)
-    return results.JobResult(
-        metrics=results.measured(findings, results.tables_of(findings, parts.tables)),
-        pairs=findings.evaluation.table,
-        policy=findings.protocol_result.policy,
-        figures=(),
-        folder=None,
-        computed=results.Computed(config, parts, findings),
-    )
+    return steps.find(context, parts, config).with_tables(config)

@@ -6,7 +6,7 @@ import logging
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -37,13 +37,16 @@ from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.base import MetricSet
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
+from cfx.evaluation.sites import site_table
 from cfx.learners.base import Learner
+from cfx.learners.curves import learning_curves
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
 from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
-from cfx.results.provenance import distributions
-from cfx.results.table import Findings, ResultTable, chosen_tables
+from cfx.results.provenance import commit, distributions, version
+from cfx.results.result import Result
+from cfx.results.table import chosen_tables
 from cfx.results.tracker import folder_of, is_run_id
 from cfx.simulation.base import Simulator
 from cfx.simulation.rollout import MemorySimulator, MemoryStepper
@@ -135,7 +138,6 @@ class Parts:
     learner: Learner
     protocol: Protocol
     metrics: MetricSet
-    tables: tuple[registry.Installed[ResultTable], ...]
     engine: Engine
     demo: Demo | None = None
 
@@ -158,6 +160,8 @@ class Parts:
             learner.require_gradients(model, simulator.differentiable)
         if "policy" not in protocol.determines():  # else the policy has been trained already
             learner.require_no_driver_features(policy)
+        # Tables have no state: each is made when it is written. A name that is none is told now.
+        chosen_tables(config.tables, distributions(config.model_dump()))
         demo = None
         if config.demo is not None:
             demo = cast(Demo, registry.create("demo", config.demo))
@@ -171,7 +175,6 @@ class Parts:
             learner=learner,
             protocol=protocol,
             metrics=MetricSet.of(config.metrics),
-            tables=chosen_tables(config.tables, distributions(config.model_dump())),
             engine=cast(Engine, registry.create("engine", config.engine)),
             demo=demo,
         )
@@ -341,24 +344,71 @@ def without_files(config: JobConfig, pairs: PairSet) -> tuple[JobConfig, Parts, 
     return config, parts, compose(uncached, parts, pairs, style)
 
 
-def find(context: ProtocolContext, parts: Parts, calibration: CalibrationSettings) -> Findings:
+def find(context: ProtocolContext, parts: Parts, config: JobConfig) -> Result:
     """Runs the protocol; returns what it has delivered, with tables of the calibration.
 
     Raises:
         PluginError: it delivers no `ProtocolResult`.
     """
     with closing(context.simulator), closing(parts.engine):
-        result: object = parts.protocol.run(context)
-        if not isinstance(result, ProtocolResult):
+        delivered: object = parts.protocol.run(context)
+        if not isinstance(delivered, ProtocolResult):
             raise PluginError(
                 f"{registry.origin(parts.protocol)}: run must return a cfx.plugin.ProtocolResult,"
-                f" but returned a {type(result).__name__}"
+                f" but returned a {type(delivered).__name__}"
             )
         purpose = Purpose.of(parts.model, parts.policy)
-        evaluation = replace(result.evaluation, purpose=purpose).distinct_methods()
-        tables = calibration_tables(context, evaluation, calibration)
+        evaluation = replace(delivered.evaluation, purpose=purpose).distinct_methods()
+        tables = calibration_tables(context, evaluation, config.calibration)
     if "slices" in tables:
         evaluation = evaluation.with_slices(tables["slices"])
-    evaluation = replace(evaluation, tables={**evaluation.tables, **tables})
-    result = replace(result, evaluation=evaluation)
-    return Findings(context.pairs, context.style, result, context.seed)
+    evaluation = replace(
+        evaluation,
+        tables={**evaluation.tables, **tables, **job_tables(context, delivered, evaluation)},
+        notes=delivered.notes,
+        recorded=context.pairs,
+        style=context.style,
+        seed=context.seed,
+    )
+    metrics = {**evaluation.metrics(), **delivered.calibration}
+    if delivered.labels is not None:
+        metrics |= delivered.labels.metrics()
+    return Result.of(
+        evaluation,
+        config=config.model_dump(mode="json"),
+        data=description(context.pairs, delivered, config, parts),
+        metrics=metrics,
+        trained=delivered.policy,
+    )
+
+
+def job_tables(
+    context: ProtocolContext, delivered: ProtocolResult, evaluation: Evaluation
+) -> dict[str, pd.DataFrame]:
+    """Returns the tables `curves`, `labels` and `sites`, what there is of them."""
+    tables = {"curves": learning_curves(delivered.curves)}
+    if delivered.labels is not None:
+        tables["labels"] = delivered.labels.to_frame(context.pairs, evaluation.names)
+    sites = site_table(context.pairs, evaluation, seed=context.seed)
+    if sites is not None:
+        tables["sites"] = sites
+    return tables
+
+
+def description(
+    pairs: PairSet, delivered: ProtocolResult, config: JobConfig, parts: Parts
+) -> dict[str, Any]:
+    """Returns what `data.json` says of the data and the job; the evaluation says the rest."""
+    dropped = []
+    for drop in pairs.dropped:
+        dropped.append({"reason": drop.reason, "count": drop.count, "unit": drop.unit})
+    return {
+        "source": pairs.source,
+        "fingerprint": pairs.fingerprint,
+        "pairs": len(pairs),
+        "protocol": dict(delivered.notes),
+        "dropped": dropped,
+        "objective": {"name": config.objective["name"], "unit": parts.objective.unit},
+        "cfx": version(),
+        "commit": commit(Path.cwd()),
+    }

@@ -38,7 +38,7 @@ _AFTER_OVERRIDES = (_OVER, "rmse_speed_default")
 def metric_columns(folders: Sequence[Path]) -> list[MetricInfo]:
     """Returns the metrics that any of these jobs has measured, besides the RMSE of speed."""
     from cfx.core.job_folder import optional, read_json, read_metrics
-    from cfx.figures.job import known_metrics
+    from cfx.results.result import known_metrics
 
     found: dict[str, MetricInfo] = {}
     for folder in folders:

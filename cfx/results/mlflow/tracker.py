@@ -26,12 +26,14 @@ from cfx.evaluation.headline import RESULT, fitted_errors, headline
 from cfx.evaluation.result import Purpose
 from cfx.learners.curves import over_networks
 from cfx.results import provenance
+from cfx.results.folder import CONFIG, DATA, METRICS
 from cfx.results.mlflow.store import Store, open_store, tracking_uri, translate_errors
+from cfx.results.table import file_of, installed
 from cfx.results.tracker import Tracker
 
 if TYPE_CHECKING:
     from cfx.results.config import JobConfig
-    from cfx.results.table import Findings, Kept
+    from cfx.results.result import Result
 
 log = logging.getLogger(__name__)
 
@@ -171,26 +173,30 @@ class MlflowTracker(Tracker):
         with translate_errors("log tags"):
             self.store.client.log_batch(self.run_id, tags=_tags(tags))
 
-    def log_job(self, findings: Findings, kept: Kept, description: str) -> None:
-        values, result = headline(kept.metrics)
-        self.log_metrics({**values, **_fitted(findings), **kept.metrics})
-        tags = {RESULT: result, "mlflow.note.content": description}
-        if findings.evaluation.purpose is Purpose.CALIBRATION:
+    def log_job(self, result: Result, description: str) -> None:
+        folder, pairs = result.folder, result.evaluation.recorded
+        assert folder is not None
+        assert pairs is not None
+        values, words = headline(result.metrics)
+        self.log_metrics({**values, **_fitted(result), **result.metrics})
+        tags = {RESULT: words, "mlflow.note.content": description}
+        is_calibration = result.purpose is Purpose.CALIBRATION
+        if is_calibration:
             tags["learner"] = "none"
         self.set_tags(tags)
-        self.log_data(findings.pairs)
-        self.log_curves(findings.protocol_result.curves)
-        self.log_files(kept.figures, "figures")
-        if findings.evaluation.purpose is Purpose.CALIBRATION:
-            self.log_files(sorted((kept.folder / "policy").iterdir()), "policy")
+        self.log_data(pairs)
+        self.log_curves(result.evaluation.tables["curves"])
+        self.log_files(result.figures, "figures")
+        if is_calibration:
+            self.log_files(sorted((folder / "policy").iterdir()), "policy")
         else:
-            self.log_policy(kept.folder / "policy", findings.pairs)
-        files = list(kept.files)
-        for table in kept.tables:
-            if table.about.part.tracked:
-                files.append(kept.folder / table.file)
-            if table.about.part.tracked == "table" and table.rows is not None:
-                self.log_table(table.rows, f"{table.about.name}.json")
+            self.log_policy(folder / "policy", pairs)
+        files = [folder / CONFIG, folder / METRICS, folder / DATA, *result.demo]
+        for table in installed():
+            if table.name in result.tables and table.part.tracked:
+                files.append(folder / file_of(table))
+                if table.part.tracked == "table" and not table.part.large:
+                    self.log_table(result.tables[table.name], f"{table.name}.json")
         self.log_files(files)
 
     def log_metrics(self, metrics: Mapping[str, float]) -> None:
@@ -350,13 +356,13 @@ class MlflowTracker(Tracker):
                     _settle(self.store, self._parent_id, _safe(self._sweep))
 
 
-def _fitted(findings: Findings) -> dict[str, float]:
+def _fitted(result: Result) -> dict[str, float]:
     """Returns the errors of driver-specific parameters where they were calibrated, if known."""
-    fits = findings.evaluation.tables.get("fits")
-    if fits is None:
+    if "fits" not in result.tables:
         return {}
-    own = fits[fits["method"] == "fixed"].mean(numeric_only=True)
-    return fitted_errors({str(name).removeprefix("train_"): value for name, value in own.items()})
+    fits = result.tables["fits"]
+    means = fits[fits["method"] == "fixed"].mean(numeric_only=True)
+    return fitted_errors({str(name).removeprefix("train_"): mean for name, mean in means.items()})
 
 
 def _run_name(config: JobConfig, names: Mapping[str, str]) -> str:

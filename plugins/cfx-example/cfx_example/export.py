@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 
 from cfx.errors import DataError
-from cfx.plugin import ExportFormat, examine, folder_of, read_tables, write_output
+from cfx.plugin import ExportFormat, examine, folder_of, stored_tables, write_output
 
 FILE = "driver_json.json"
 PREFIX = "parameter_"
@@ -21,7 +21,7 @@ class DriverJson(ExportFormat):
     def write(self, run: str, output: Path | None) -> list[str]:
         folder = folder_of(run)
         examine(folder)  # the folder may be another person's
-        pairs = read_tables(folder, "pairs").get("pairs")
+        pairs = stored_tables(folder).get("pairs")
         if pairs is None:
             raise DataError(f"{folder} holds no pairs.csv; give the output folder of a job")
         fixed = pairs[pairs["method"] == "fixed"].set_index("pair_id").filter(like=PREFIX)

@@ -5,7 +5,7 @@ A job that names it calls `draw` once at its end, `cfx report` and `cfx figures`
 
 from __future__ import annotations
 
-from cfx.plugin import JobFigure, Results, canvas
+from cfx.plugin import JobFigure, Result, canvas
 from matplotlib.figure import Figure
 
 
@@ -18,10 +18,10 @@ class PolicyErrors(JobFigure):
         " follows it better than constant parameters do."
     )
 
-    def draw(self, results: Results) -> Figure | None:
-        if not {"policy", "fixed"} <= set(results.methods):
+    def draw(self, result: Result) -> Figure | None:
+        if not {"policy", "fixed"} <= set(result.shown_methods):
             return None
-        errors = results.pairs.pivot(index="pair_id", columns="method", values="rmse_speed")
+        errors = result.pairs.pivot(index="pair_id", columns="method", values="rmse_speed")
         figure = canvas(3.9)
         axes = figure.subplots()
         axes.scatter(errors["fixed"], errors["policy"])

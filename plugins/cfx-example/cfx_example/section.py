@@ -9,17 +9,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from cfx.plugin import Job
+from cfx.plugin import Result
 from cfx_report.jobs import Runs
 from cfx_report.section import Cell, Column, Section, Sheet, number
 
 
-def name(job: Job) -> str:
+def name(job: Result) -> str:
     """Returns what a job is called in the report."""
     return job.name
 
 
-def frames(job: Job) -> Cell:
+def frames(job: Result) -> Cell:
     """Returns how many frames of all pairs were tested."""
     return number(job.pairs.query("method == 'default'")["frames"].sum(), ".0f")
 
@@ -36,7 +36,7 @@ class FrameCounts(Section):
     """
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
-        columns: tuple[Column[Job], ...] = (
+        columns: tuple[Column[Result], ...] = (
             Column("Job", name),
             Column("Frames", frames, "Over all pairs."),
         )

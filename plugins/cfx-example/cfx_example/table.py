@@ -10,7 +10,8 @@ from collections.abc import Iterable
 
 import numpy as np
 import pandas as pd
-from cfx.plugin import Column, Findings, ResultTable
+from cfx.plugin import Column, Evaluation, ResultTable
+from numpy.typing import NDArray
 
 
 class SpeedBins(ResultTable):
@@ -22,11 +23,15 @@ class SpeedBins(ResultTable):
         Column("frames", "1", "measured frames in the bin", "int"),
     )
 
-    def rows(self, findings: Findings) -> Iterable[pd.DataFrame | None]:
-        speeds = np.concatenate([pair.follower_speed for pair in findings.pairs])
+    def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
+        speeds = _speeds(evaluation)
         bins, counts = np.unique(np.floor(speeds), return_counts=True)
         return [pd.DataFrame({"speed": bins, "frames": counts})]
 
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        speeds = np.concatenate([pair.follower_speed for pair in findings.pairs])
-        return {"speed_bins/highest": float(speeds.max())}
+    def metrics(self, evaluation: Evaluation) -> dict[str, float]:
+        return {"speed_bins/highest": float(_speeds(evaluation).max())}
+
+
+def _speeds(evaluation: Evaluation) -> NDArray[np.float64]:
+    """Returns all measured speeds of followers, m/s."""
+    return np.concatenate([pair.follower_speed for pair in evaluation.recorded or ()])

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from cfx.errors import TrackingError
-from cfx.plugin import Findings, JobConfig, Kept, Origin, Tracker, Tracking
+from cfx.plugin import JobConfig, Origin, Result, Tracker, Tracking
 
 FILE = "run_list.jsonl"
 PREFIX = "run_list-"
@@ -36,8 +36,8 @@ class FileTracker(Tracker):
     def set_tags(self, tags: Mapping[str, str]) -> None:
         self.tags.update(tags)
 
-    def log_job(self, findings: Findings, kept: Kept, description: str) -> None:
-        self.metrics.update(kept.metrics)
+    def log_job(self, result: Result, description: str) -> None:
+        self.metrics.update(result.metrics)
 
     def how_to_open(self) -> tuple[str, ...]:
         return (f"Run {self.run_id} in {self.file}",)

@@ -2,7 +2,7 @@
 
 import cfx
 import pandas as pd
-from cfx.plugin import Results
+from cfx.plugin import Result
 
 from cfx_example.figure import PolicyErrors
 
@@ -21,7 +21,7 @@ def test_cfx_finds_it():
 
 
 def test_each_pair_is_a_point():
-    figure = PolicyErrors().draw(Results(ERRORS, ("fixed", "policy"), ()))
+    figure = PolicyErrors().draw(Result(tables={"pairs": ERRORS}))
     (axes,) = figure.axes
     (points,) = axes.collections
     assert points.get_offsets().tolist() == [[0.5, 0.25], [0.75, 1.0]]
@@ -29,4 +29,4 @@ def test_each_pair_is_a_point():
 
 def test_a_job_without_a_policy_has_none():
     only_fixed = ERRORS[ERRORS["method"] == "fixed"]
-    assert PolicyErrors().draw(Results(only_fixed, ("fixed",), ())) is None
+    assert PolicyErrors().draw(Result(tables={"pairs": only_fixed})) is None

@@ -20,5 +20,5 @@ def test_cfx_finds_it():
 
 def test_each_frame_is_counted_once():
     pairs = [SimpleNamespace(follower_speed=np.array([0.5, 3.1, 3.9]))]
-    (rows,) = SpeedBins().rows(SimpleNamespace(pairs=pairs))
+    (rows,) = SpeedBins().rows(SimpleNamespace(recorded=pairs))
     assert rows.to_dict("list") == {"speed": [0.0, 3.0], "frames": [1, 2]}

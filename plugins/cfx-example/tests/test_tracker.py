@@ -22,7 +22,7 @@ def track(folder, metrics, uri=None):
     config = SimpleNamespace(tracking=SimpleNamespace(uri=uri))
     with RunList().run(config, folder) as tracker:
         tracker.set_tags({"dataset.pairs": "2"})
-        tracker.log_job(None, SimpleNamespace(metrics=metrics), "")
+        tracker.log_job(SimpleNamespace(metrics=metrics), "")
     return tracker.run_id
 
 

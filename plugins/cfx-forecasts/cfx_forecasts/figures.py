@@ -18,7 +18,7 @@ from cfx.plugin import (
     JobFigure,
     Line,
     PairTrajectory,
-    Results,
+    Result,
     canvas,
     colour_of,
     draw_lines,
@@ -167,9 +167,9 @@ class ForecastErrors(JobFigure):
     )
     order = 110
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where forecasts were made."""
-        table = results.tables.get("forecasts")
+        table = result.tables.get("forecasts")
         if table is None:
             return None
         of_driver = errors_by(table, ["method", "horizon_s", "driver"])
@@ -185,9 +185,9 @@ class ForecastsByHistory(JobFigure):
     caption = "The same forecasts, by how much of the driver had been measured before the origin."
     order = 111
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where origins have so different histories that they can be told apart."""
-        table = results.tables.get("forecasts")
+        table = result.tables.get("forecasts")
         if table is None:
             return None
         by_history = errors_by_history(table)
@@ -209,11 +209,11 @@ class Distributions(JobFigure):
     )
     order = 112
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where forecasts were sampled."""
-        if not {"distributions", "forecasts"} <= set(results.tables):
+        if not {"distributions", "forecasts"} <= set(result.tables):
             return None
-        return draw_distributions(results.tables["distributions"], results.tables["forecasts"])
+        return draw_distributions(result.tables["distributions"], result.tables["forecasts"])
 
 
 TIME_TITLE = "time since the test part began (s)"
@@ -292,13 +292,13 @@ class ErrorOverTime(JobFigure):
     )
     order = 40
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where trajectories are known."""
-        if not len(results.trajectories):
+        if not len(result.trajectories):
             return None
-        simulated = results.trajectories[0].speed
+        simulated = result.trajectories[0].speed
         methods = []
-        for method in results.methods:
+        for method in result.shown_methods:
             if method in simulated and method not in HIDDEN:
                 methods.append(method)
-        return draw_errors(results.trajectories, methods, results.transient_s)
+        return draw_errors(result.trajectories, methods, result.transient_s)

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.plugin import Job, key_of
+from cfx.plugin import Result, key_of
 from cfx_forecasts.distributions import centre_errors, sampled_methods, summarize_distributions
 from cfx_forecasts.errors import SCOPE, forecast_methods, metric_name
 from cfx_forecasts.figures import sampled_name
@@ -72,7 +72,7 @@ over drivers. Origins of one driver overlap, so they are never counted as indepe
         return {"forecasts": found, "methods": methods_explained(methods)} if found else None
 
 
-def errors(job: Job, table: pd.DataFrame, error: str, unit: str) -> Sheet:
+def errors(job: Result, table: pd.DataFrame, error: str, unit: str) -> Sheet:
     """Returns a row per method and a column per horizon.
 
     Args:
@@ -90,7 +90,7 @@ def errors(job: Job, table: pd.DataFrame, error: str, unit: str) -> Sheet:
     return Sheet.of(columns, forecast_methods(table))
 
 
-def _error(job: Job, metric: str, method: str) -> Cell:
+def _error(job: Result, metric: str, method: str) -> Cell:
     key = key_of(metric, method, SCOPE)
     low = job.metrics.get(f"{key}/ci95_low", math.nan)
     high = job.metrics.get(f"{key}/ci95_high", math.nan)

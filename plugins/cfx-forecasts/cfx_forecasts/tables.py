@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 
 from rich.table import Table
 
-from cfx.plugin import Column, Findings, ResultTable, metrics_table
+from cfx.plugin import Column, Evaluation, ResultTable, metrics_table
 from cfx_forecasts.distributions import LEVEL, centre_errors, distribution_metrics, sampled_methods
 from cfx_forecasts.errors import SCOPE, forecast_methods, forecast_metrics, metric_name
 
@@ -31,13 +31,13 @@ class ForecastErrors(ResultTable):
         Column("ade", "m", "absolute error of position, mean over the way to the horizon"),
     )
 
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        return forecast_metrics(findings.evaluation.tables["forecasts"], findings.seed)
+    def metrics(self, evaluation: Evaluation) -> dict[str, float]:
+        return forecast_metrics(evaluation.tables["forecasts"], evaluation.seed)
 
-    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
+    def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[Table]:
         """Returns the RMSE of speed of each method at each horizon: mean over drivers."""
-        table = findings.evaluation.tables["forecasts"]
-        about = findings.protocol_result.notes["forecasts"]
+        table = evaluation.tables["forecasts"]
+        about = evaluation.notes["forecasts"]
         leader = "given"
         if about["leader"] != "given":
             leader = f"predicted at {about['leader'].replace('_', ' ')}"
@@ -73,16 +73,16 @@ class Distributions(ResultTable):
         Column("likelihood_time_to_collision", "1", "likewise"),
     )
 
-    def metrics(self, findings: Findings) -> dict[str, float]:
-        return distribution_metrics(findings.evaluation.tables["distributions"])
+    def metrics(self, evaluation: Evaluation) -> dict[str, float]:
+        return distribution_metrics(evaluation.tables["distributions"])
 
-    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
+    def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[Table]:
         """Returns the CRPS of speed of each sampled method at each horizon, and its coverage.
 
         The policy's centre, a single path, has its absolute error instead, and no coverage.
         """
-        tables = findings.evaluation.tables
-        horizons = findings.protocol_result.notes["forecasts"]["horizons_s"]
+        tables = evaluation.tables
+        horizons = evaluation.notes["forecasts"]["horizons_s"]
         methods = sampled_methods(tables["distributions"])
         crps, coverage = {}, {}
         for horizon in horizons:

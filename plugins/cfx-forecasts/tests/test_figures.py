@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from cfx.figures.figure import Results, draw_figure, figure_named
+from cfx.figures.drawing import draw_figure, figure_named
 from cfx.figures.text import colour_of
+from cfx.results.result import Result
 from cfx_forecasts.distributions import centre_errors, summarize_distributions
 from cfx_forecasts.errors import errors_by_history, forecast_methods, summarize_forecasts
 from cfx_forecasts.figures import (
@@ -102,7 +103,7 @@ def test_errors_over_time_are_those_of_the_pairs_that_still_drive() -> None:
         [shortened[0], *drives[1:]], "policy", "speed"
     )  # three of four are not nearly all
     assert len(seconds) == 11
-    results = Results.of(make_results(pairs=3).evaluation)
+    results = Result.of(make_results(pairs=3).evaluation)
     figure = draw_figure(figure_named("error_over_time"), results)
     assert figure is not None
     assert "time since the test part began" in texts(figure)

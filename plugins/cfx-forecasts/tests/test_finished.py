@@ -49,7 +49,7 @@ def test_contract(forecast: Forecast) -> None:
     check_contract(forecast)
 
 
-def job(base: list[str], run: Path, folder: Path, *overrides: str) -> cfx.JobResult:
+def job(base: list[str], run: Path, folder: Path, *overrides: str) -> cfx.plugin.Result:
     return cfx.run([*base, f"protocol.run={run}", f"hydra.run.dir={folder}", *overrides])
 
 

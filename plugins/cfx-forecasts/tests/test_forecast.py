@@ -6,17 +6,13 @@ import io
 import json
 import logging
 from pathlib import Path
-from typing import Any, cast
 
 import pandas as pd
 import pytest
 from rich.console import Console
 
 import cfx
-from cfx.data.pairs import PairSet
 from cfx.errors import CfxError
-from cfx.evaluation.protocols.base import ProtocolResult
-from cfx.results.table import Findings
 from cfx_forecasts.errors import FORECAST_METHODS
 from cfx_forecasts.tables import ForecastErrors
 from tests.evaluation.protocols.test_across_drivers import QUICK
@@ -33,13 +29,13 @@ FORECAST = [
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
+def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.plugin.Result:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("forecast"))
         return cfx.run([*FORECAST, "policy=fixed"])
 
 
-def test_all_methods_are_forecast_from_the_same_origins(result: cfx.JobResult) -> None:
+def test_all_methods_are_forecast_from_the_same_origins(result: cfx.plugin.Result) -> None:
     table = pd.read_parquet(result.folder / "forecasts.parquet")
     methods = set(table["method"])
     assert methods <= set(FORECAST_METHODS)
@@ -53,7 +49,7 @@ def test_all_methods_are_forecast_from_the_same_origins(result: cfx.JobResult) -
     assert notes["origins"]["0.5"] == len(table) / len(methods) - notes["origins"]["2"]
 
 
-def test_forecasts_stand_in_every_table(result: cfx.JobResult) -> None:
+def test_forecasts_stand_in_every_table(result: cfx.plugin.Result) -> None:
     long = pd.read_parquet(result.folder / "pair_metrics.parquet")
     own = long[(long["scope"] == "forecast") & (long["metric"] == "rmse_speed_2s")]
     means = own.groupby("method")["value"].mean()
@@ -66,29 +62,22 @@ def test_forecasts_stand_in_every_table(result: cfx.JobResult) -> None:
     pd.testing.assert_series_equal(
         wide["forecast_rmse_speed_2s"], rows, check_names=False, rtol=1e-9
     )
-    assert result.evaluation is not None
-    about = json.loads((result.folder / "data.json").read_text())["protocol"]
-    findings = Findings(
-        PairSet((), ""),
-        cast(Any, None),
-        ProtocolResult(result.evaluation, result.policy, pd.DataFrame(), None, about),
-    )
     console = Console(file=io.StringIO(), width=80)
-    console.print(*ForecastErrors().console(findings, result.metrics))
+    console.print(*ForecastErrors().console(result.evaluation, result.metrics))
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
     assert f"{result.metrics['forecast/rmse_speed_0.5s/fixed']:.3f}" in shown
     assert "constant_acceleration" in shown
 
 
-def test_pooled_parameters_as_policy_forecast_the_same(result: cfx.JobResult) -> None:
+def test_pooled_parameters_as_policy_forecast_the_same(result: cfx.plugin.Result) -> None:
     for error in ("rmse_speed_0.5s", "fde_2s"):
         policy = result.metrics[f"forecast/{error}/policy"]
         assert policy == result.metrics[f"forecast/{error}/population"]
 
 
 def test_driver_specific_parameters_read_nothing_after_the_first_origin(
-    result: cfx.JobResult, monkeypatch: pytest.MonkeyPatch, tmp_path: object
+    result: cfx.plugin.Result, monkeypatch: pytest.MonkeyPatch, tmp_path: object
 ) -> None:
     """Calibrated on three seconds they are not those of the closed-loop test, from 80 %."""
     table = pd.read_parquet(result.folder / "forecasts.parquet")

@@ -22,8 +22,8 @@ from cfx.plugin import (
     ExportFormat,
     create,
     folder_of,
-    read_tables,
     read_yaml,
+    stored_tables,
     write_output,
 )
 
@@ -55,7 +55,7 @@ class NetcdfExport(ExportFormat):
         folder = folder_of(run)
         if output is None:
             output = (folder if Path(run).expanduser().is_dir() else Path()) / NAME
-        tables = read_tables(folder, "posterior", "prior", "population", "fits")
+        tables = stored_tables(folder)
         if "posterior" not in tables or "fits" not in tables:
             raise DataError(
                 f"{run}: this job has found no posterior; run one with"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from cfx.plugin import TEST, Job, MetricInfo, Purpose, pretty_unit
+from cfx.plugin import TEST, MetricInfo, Purpose, Result, pretty_unit
 
 
 @dataclass(frozen=True)
@@ -20,21 +20,21 @@ class Unfinished:
 class Runs:
     """What was found: finished jobs, each with a name of its own, and the others."""
 
-    jobs: tuple[Job, ...]
+    jobs: tuple[Result, ...]
     unfinished: tuple[Unfinished, ...] = ()
 
 
-def of_purpose(jobs: Iterable[Job], *purposes: Purpose) -> list[Job]:
+def of_purpose(jobs: Iterable[Result], *purposes: Purpose) -> list[Result]:
     """Returns the jobs that have one of these purposes."""
     return [job for job in jobs if job.purpose in purposes]
 
 
-def are_calibrations(jobs: Iterable[Job]) -> bool:
+def are_calibrations(jobs: Iterable[Result]) -> bool:
     """Says whether none of the jobs has a policy that adapts: nothing is said of policies then."""
     return all(job.purpose is Purpose.CALIBRATION for job in jobs)
 
 
-def any_baselines(jobs: Iterable[Job], scope: str = TEST) -> list[str]:
+def any_baselines(jobs: Iterable[Result], scope: str = TEST) -> list[str]:
     """Returns what the policy of any of the jobs is compared with, in the order of the jobs."""
     found: dict[str, None] = {}
     for job in jobs:
@@ -42,7 +42,7 @@ def any_baselines(jobs: Iterable[Job], scope: str = TEST) -> list[str]:
     return list(found)
 
 
-def any_has_metric(jobs: Iterable[Job], name: str, method: str, scope: str = TEST) -> bool:
+def any_has_metric(jobs: Iterable[Result], name: str, method: str, scope: str = TEST) -> bool:
     """Says whether any of the jobs has measured a metric."""
     return any(job.has_metric(name, method, scope) for job in jobs)
 

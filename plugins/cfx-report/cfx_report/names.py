@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cfx.errors import ConfigError
-from cfx.plugin import Job, Purpose, common_prefix, flatten
+from cfx.plugin import Purpose, Result, common_prefix, flatten
 from cfx_report.jobs import any_baselines
 
 GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")
@@ -35,7 +35,7 @@ _LONG = 24
 """Characters of a value from which on what all jobs' values begin with is left out."""
 
 
-def named(jobs: Sequence[Job]) -> tuple[Job, ...]:
+def named(jobs: Sequence[Result]) -> tuple[Result, ...]:
     """Gives every job a short name: its driving model, and what else differs between the jobs."""
     columns = _columns(jobs, ())
     if len(columns) > _MOST:
@@ -50,7 +50,7 @@ def named(jobs: Sequence[Job]) -> tuple[Job, ...]:
     return tuple(renamed)
 
 
-def shortest_names(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[str]:
+def shortest_names(jobs: Sequence[Result], ignored: Sequence[str] = ()) -> list[str]:
     """Returns names of as few parts as tell apart what `differences` tells apart."""
     return _joined(_telling(_columns(jobs, ignored)))
 
@@ -78,7 +78,7 @@ def _kinds(columns: Sequence[Sequence[str]], chosen: Sequence[int]) -> int:
     return len(set(zip(*(columns[one] for one in chosen), strict=True)))
 
 
-def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[str]]:
+def differences(jobs: Sequence[Result], ignored: Sequence[str] = ()) -> list[list[str]]:
     """Returns for every job its driving model and every other component and setting that differs.
 
     A setting of a component counts only between jobs that share the component: that of another one
@@ -94,7 +94,7 @@ def differences(jobs: Sequence[Job], ignored: Sequence[str] = ()) -> list[list[s
     return parts
 
 
-def _columns(jobs: Sequence[Job], ignored: Sequence[str]) -> list[list[str]]:
+def _columns(jobs: Sequence[Result], ignored: Sequence[str]) -> list[list[str]]:
     """Returns the models, and a column for everything else that differs; "" where it is absent."""
     columns = [[job.component("model") or "model" for job in jobs]]
     for group in GROUPS[1:]:
@@ -111,7 +111,7 @@ def _columns(jobs: Sequence[Job], ignored: Sequence[str]) -> list[list[str]]:
     return [first, *(column for column in others if len(set(column)) > 1)]
 
 
-def _differs(key: str, jobs: Sequence[Job], flat: Sequence[Mapping[str, Any]]) -> bool:
+def _differs(key: str, jobs: Sequence[Result], flat: Sequence[Mapping[str, Any]]) -> bool:
     """Says whether a setting differs between jobs that share the component it belongs to."""
     group = key.partition(".")[0]
     found: dict[str, set[Any]] = {}
@@ -149,7 +149,7 @@ class Row:
     """
 
     name: str
-    jobs: tuple[Job, ...]
+    jobs: tuple[Result, ...]
 
     def values(self, name: str, method: str) -> np.ndarray:
         """Returns a metric of a method in each job, `(jobs,)`."""
@@ -163,11 +163,11 @@ class Row:
         values = np.full(len(self.jobs), np.nan)
         for place, job in enumerate(self.jobs):
             if baseline in job.baselines():
-                values[place] = job.improvement(statistic, baseline)
+                values[place] = getattr(job.statistics(baseline), statistic)
         return values
 
 
-def rows_of(jobs: Sequence[Job], group_by: str | None = None) -> tuple[Row, ...]:
+def rows_of(jobs: Sequence[Result], group_by: str | None = None) -> tuple[Row, ...]:
     """Returns the rows of a table, in the order of the jobs.
 
     Raises:
@@ -180,14 +180,14 @@ def rows_of(jobs: Sequence[Job], group_by: str | None = None) -> tuple[Row, ...]
             " instance seed or data.max_pairs"
         )
     names = shortest_names(jobs, ignored)
-    found: dict[str, list[Job]] = {}
+    found: dict[str, list[Result]] = {}
     for number, (name, job) in enumerate(zip(names, jobs, strict=True)):
         key = name if group_by is not None or names.count(name) == 1 else f"{name} ({number + 1})"
         found.setdefault(key, []).append(job)
     return tuple(Row(name, tuple(alike)) for name, alike in found.items())
 
 
-def rows_over_seeds(jobs: Sequence[Job]) -> tuple[Row, ...]:
+def rows_over_seeds(jobs: Sequence[Result]) -> tuple[Row, ...]:
     """Returns the jobs in rows, those that differ in the seed alone together."""
     if len({job.setting("seed") for job in jobs}) < 2:
         return rows_of(jobs)
@@ -199,7 +199,7 @@ def methods_of(rows: Sequence[Row]) -> list[str]:
     found: dict[str, None] = {}
     for row in rows:
         for job in row.jobs:
-            found |= dict.fromkeys(job.meaningful_methods)
+            found |= dict.fromkeys(job.shown_methods)
     found.pop("policy", None)
     if any_adapts(rows):
         return [*found, "policy"]
@@ -217,7 +217,7 @@ def any_adapts(rows: Sequence[Row]) -> bool:
 
 def baselines_of(rows: Sequence[Row]) -> list[str]:
     """Returns the calibrations that any job compares its policy with."""
-    jobs: list[Job] = []
+    jobs: list[Result] = []
     for row in rows:
         jobs += row.jobs
     found = any_baselines(jobs)

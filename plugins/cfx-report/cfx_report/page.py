@@ -18,8 +18,8 @@ from cfx.plugin import (
     COLOURS,
     TEST,
     Comparison,
-    Job,
     Purpose,
+    Result,
     contradiction,
     draw_figure,
     explained,
@@ -109,10 +109,10 @@ def _environment(runs: Runs) -> Environment:
     return environment
 
 
-def _drawn(environment: Environment, name: str, job: Job) -> Any:
+def _drawn(environment: Environment, name: str, job: Result) -> Any:
     """Returns the figure of a name as the job has written it; "" if the job lacks its data."""
     found = figure_named(name)
-    drawing = draw_figure(found, job.results)
+    drawing = draw_figure(found, job)
     if drawing is None:
         return ""
     figure: Any = environment.globals["figure"]
@@ -127,7 +127,7 @@ def _section(environment: Environment, section: Section, runs: Runs) -> str:
     return template.render(runs=runs, section=section, **context)
 
 
-def _title(jobs: Sequence[Job]) -> str:
+def _title(jobs: Sequence[Result]) -> str:
     """Returns a title that names the driving models."""
     subject = (
         "Calibration"
@@ -164,7 +164,7 @@ _MOST = 3
 """Up to so many jobs have a sentence each."""
 
 
-def summary(jobs: Sequence[Job]) -> list[str]:
+def summary(jobs: Sequence[Result]) -> list[str]:
     """Returns sentences: against driver-specific calibration, and against pooled calibration."""
     first = (
         f"{_amount(jobs)}: is a policy that adapts the parameters closer to the real driver than"
@@ -186,7 +186,7 @@ def summary(jobs: Sequence[Job]) -> list[str]:
     return [first, counts, _best(jobs), *warnings, *references]
 
 
-def _few(jobs: Sequence[Job]) -> list[str]:
+def _few(jobs: Sequence[Result]) -> list[str]:
     """Returns a warning if any of the jobs compares its policy on few drivers."""
     if not jobs:
         return []
@@ -195,7 +195,7 @@ def _few(jobs: Sequence[Job]) -> list[str]:
     return [warning] if warning else []
 
 
-def _counts(jobs: Sequence[Job]) -> str:
+def _counts(jobs: Sequence[Result]) -> str:
     """Returns in how many jobs the policy is closer, over each of two baselines."""
     said = []
     for baseline, against in (
@@ -211,7 +211,7 @@ def _counts(jobs: Sequence[Job]) -> str:
     return "; ".join(said)
 
 
-def _best(jobs: Sequence[Job]) -> str:
+def _best(jobs: Sequence[Result]) -> str:
     """Says which job improves most, or which jobs over their seeds: no lucky seed is picked."""
     rows = [row for row in rows_over_seeds(jobs) if of_purpose(row.jobs, Purpose.ADAPTATION)]
     best = max(rows, key=_mean_for_ranking)
@@ -232,7 +232,7 @@ def _mean_for_ranking(row: Row) -> float:
     return float(known.mean()) if len(known) else -np.inf
 
 
-def _reference(job: Job) -> str:
+def _reference(job: Result) -> str:
     """Says what a policy reaches that sets the acceleration itself."""
     speed, gap = job.metric("rmse_speed", "policy"), job.metric("rmse_gap", "policy")
     return (
@@ -241,7 +241,7 @@ def _reference(job: Job) -> str:
     )
 
 
-def _calibration(job: Job) -> str:
+def _calibration(job: Result) -> str:
     """Says how close constant parameters come."""
     errors = []
     for method in job.methods:
@@ -254,7 +254,7 @@ def _calibration(job: Job) -> str:
     )
 
 
-def _amount(jobs: Sequence[Job]) -> str:
+def _amount(jobs: Sequence[Result]) -> str:
     pairs: set[tuple[str, str]] = set()
     sources: dict[str, None] = {}
     for job in jobs:
@@ -267,14 +267,14 @@ def _amount(jobs: Sequence[Job]) -> str:
     return f"{plural(len(pairs), 'pair')} of leader and follower{where}"
 
 
-def _side(job: Job, baseline: str = "fixed") -> str:
-    if job.improvement("ci95_low", baseline) > 0:
+def _side(job: Result, baseline: str = "fixed") -> str:
+    if job.statistics(baseline).ci95_low > 0:
         return "yes"
-    return "no" if job.improvement("ci95_high", baseline) < 0 else "undecided"
+    return "no" if job.statistics(baseline).ci95_high < 0 else "undecided"
 
 
-def _verdict(job: Job) -> str:
-    if not np.isfinite(job.improvement("mean")):
+def _verdict(job: Result) -> str:
+    if not np.isfinite(job.statistics("fixed").mean):
         return f"{job.name}: no pair has a defined improvement."
     pooled = ""
     if "population" in job.baselines():
@@ -283,9 +283,9 @@ def _verdict(job: Job) -> str:
     return f"{job.name}: {_side(job)}. Improvement of the RMSE of speed: {gain}{pooled}."
 
 
-def _gain(job: Job, baseline: str) -> str:
-    mean = job.improvement("mean", baseline)
-    low, high = job.improvement("ci95_low", baseline), job.improvement("ci95_high", baseline)
+def _gain(job: Result, baseline: str) -> str:
+    mean = job.statistics(baseline).mean
+    low, high = job.statistics(baseline).ci95_low, job.statistics(baseline).ci95_high
     if not np.isfinite(mean):
         return "not defined"
     sure = "no interval for a single driver"

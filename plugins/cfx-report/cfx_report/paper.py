@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cfx.plugin import NEARLY_BEST, Job, Purpose, short_label, without_folders, write_output
+from cfx.plugin import NEARLY_BEST, Purpose, Result, short_label, without_folders, write_output
 from cfx_report.jobs import Runs
 from cfx_report.names import Row, any_adapts, baselines_of, methods_of, rows_of
 from cfx_report.sections.calibration import sheet, slices_of, spreads_of
@@ -192,7 +192,7 @@ def _improvement(row: Row, baseline: str) -> str:
     return f"{known[0]:+.1f} % ({low:+.1f} to {high:+.1f})"
 
 
-def _command(job: Job) -> str:
+def _command(job: Result) -> str:
     """Returns what was typed, without the folders of absolute paths."""
     if job.overrides is None:
         return "not known"

@@ -11,7 +11,7 @@ from cfx.errors import ConfigError
 from cfx.plugin import Command
 
 if TYPE_CHECKING:
-    from cfx.plugin import Job
+    from cfx.plugin import Result
 
 _FORMATS = ("pdf", "svg", "png")
 _WIDTHS_MM = (30.0, 1000.0)
@@ -115,14 +115,14 @@ def draw(
                 own = Path(folder or "figures").expanduser()
                 if len(jobs) > 1:
                     own /= job.name
-            paths = write_figures(own, job.results, formats=formats, names=names)
+            paths = write_figures(own, job, formats=formats, names=names)
             said.append(f"{plural(len(paths), 'file')} in {own.absolute()}")
         if len(jobs) > 1 and names is None:
             said += _compared(jobs, Path(folder or "figures").expanduser(), formats)
     return said
 
 
-def _compared(jobs: Sequence[Job], folder: Path, formats: Sequence[str]) -> list[str]:
+def _compared(jobs: Sequence[Result], folder: Path, formats: Sequence[str]) -> list[str]:
     """Draws jobs against the one that is closest to the drivers; returns what to tell the user."""
     from cfx.plugin import against_the_best, verdict, write_figure
     from cfx_report.figures.models import draw_models

@@ -12,13 +12,13 @@ from pathlib import Path
 
 from cfx.errors import DataError, without_passwords
 from cfx.plugin import (
-    Job,
     Origin,
+    Result,
     is_url,
     local_folder,
     optional,
-    read_job,
     read_json,
+    read_result,
     tracking_of_run,
 )
 from cfx_report.jobs import Runs, Unfinished
@@ -42,12 +42,12 @@ def read_runs(runs: Sequence[str]) -> Runs:
         DataError: a folder holds no finished job, or a job's file is damaged.
         TrackingError: there is no such run.
     """
-    jobs: dict[str, Job] = {}
+    jobs: dict[str, Result] = {}
     given: dict[str, int] = {}
     unfinished: dict[str, Unfinished] = {}
     for number, run in enumerate(runs):
         for found in _read(run):
-            if isinstance(found, Job):
+            if isinstance(found, Result):
                 jobs.setdefault(found.place, found)
                 given.setdefault(found.place, number)
             else:
@@ -59,7 +59,7 @@ def read_runs(runs: Sequence[str]) -> Runs:
     return Runs(tuple(ordered), tuple(unfinished.values()))
 
 
-def _read(run: str) -> list[Job | Unfinished]:
+def _read(run: str) -> list[Result | Unfinished]:
     """Returns the jobs that one word on the command line stands for."""
     if is_url(run):
         copy = local_folder(run)
@@ -72,7 +72,7 @@ def _read(run: str) -> list[Job | Unfinished]:
     return _of_mlflow(run)
 
 
-def _of_folder(folder: Path, place: Callable[[Path], str]) -> list[Job | Unfinished]:
+def _of_folder(folder: Path, place: Callable[[Path], str]) -> list[Result | Unfinished]:
     """Returns the jobs below a folder.
 
     Args:
@@ -85,23 +85,23 @@ def _of_folder(folder: Path, place: Callable[[Path], str]) -> list[Job | Unfinis
             " MLflow run"
         )
     found = [_one(job, place(job)) for job in _job_folders(folder)]
-    if not any(isinstance(one, Job) for one in found):
+    if not any(isinstance(one, Result) for one in found):
         raise DataError(
             f"{folder} holds no finished job (a finished one has a metrics.json){_reasons(found)}"
         )
     return found
 
 
-def _of_mlflow(run: str) -> list[Job | Unfinished]:
-    found: list[Job | Unfinished] = []
+def _of_mlflow(run: str) -> list[Result | Unfinished]:
+    found: list[Result | Unfinished] = []
     for one in tracking_of_run(run).jobs_of_run(run):
-        found.append(Unfinished(one.place, one.reason) if one.folder is None else read_job(one))
-    if not any(isinstance(one, Job) for one in found):
+        found.append(Unfinished(one.place, one.reason) if one.folder is None else read_result(one))
+    if not any(isinstance(one, Result) for one in found):
         raise DataError(f"run {run} holds no finished job{_reasons(found)}")
     return found
 
 
-def _reasons(found: Sequence[Job | Unfinished]) -> str:
+def _reasons(found: Sequence[Result | Unfinished]) -> str:
     text = ""
     for one in found:
         if isinstance(one, Unfinished):
@@ -119,9 +119,9 @@ def _job_folders(folder: Path) -> Iterator[Path]:
             below[:] = sorted(set(below) - _PASSED_OVER, key=natural_order)
 
 
-def _one(folder: Path, place: str) -> Job | Unfinished:
+def _one(folder: Path, place: str) -> Result | Unfinished:
     if (folder / "metrics.json").is_file():
-        return read_job(Origin(place, folder))
+        return read_result(Origin(place, folder))
     status = optional(folder / "outcome.json", read_json) or {}
     if status.get("code"):
         return Unfinished(place, f"failed: {without_passwords(str(status.get('message', '')))}")

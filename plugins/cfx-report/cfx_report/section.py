@@ -16,7 +16,7 @@ from cfx.plugin import (
     MINUS,
     NOTHING,
     Component,
-    Job,
+    Result,
     explained,
     percent,
     short_label,
@@ -97,7 +97,7 @@ MOST = 6
 """Jobs that are drawn at once, or named in a sentence; of more, the others are folded away."""
 
 
-def lacking(jobs: tuple[Job, ...], file: str, what: str) -> str:
+def lacking(jobs: tuple[Result, ...], file: str, what: str) -> str:
     """Returns a sentence on the jobs that lack a file; "" if none does.
 
     Args:
@@ -223,7 +223,7 @@ def method_cell(method: str) -> Cell:
     return Cell(short_label(method), colour=method)
 
 
-def tested(jobs: Iterable[Job]) -> str:
+def tested(jobs: Iterable[Result]) -> str:
     """Returns which frames are tested, for instance "the last 20 % of each pair's frames"."""
     splits = sorted({job.split for job in jobs if math.isfinite(job.split)})
     if not splits:
@@ -240,6 +240,6 @@ def methods_explained(methods: Iterable[str]) -> str:
     return f"{'; '.join(parts)}."
 
 
-def job_names(jobs: Sequence[Job]) -> str:
+def job_names(jobs: Sequence[Result]) -> str:
     """Returns the names of jobs in a row."""
     return ", ".join(job.name for job in jobs)

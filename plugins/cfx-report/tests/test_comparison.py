@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from cfx.evaluation.result import Purpose
-from cfx.figures.job import Job
+from cfx.results.result import Result
 from cfx_report.page import render, summary
 from cfx_report.runs import read_runs
 from cfx_report.section import Sheet
@@ -19,7 +19,7 @@ from tests.job_folders import ACROSS, write_job
 
 from .rendered import page_of
 
-Jobs = tuple[Sequence[Job], dict[str, dict[str, float | None]]]
+Jobs = tuple[Sequence[Result], dict[str, dict[str, float | None]]]
 
 
 @pytest.fixture(scope="module")

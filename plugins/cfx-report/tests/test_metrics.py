@@ -9,7 +9,7 @@ from typing import Any
 import pandas as pd
 import pytest
 
-from cfx.figures.job import known_metrics
+from cfx.results.result import known_metrics
 from cfx_report.runs import read_runs
 from cfx_report.section import Sheet
 from cfx_report.sections.comparison import every_metric

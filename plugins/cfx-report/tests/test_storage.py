@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cfx.app import cli
-from cfx.app.job.results import Upload
+from cfx.results.folder import Upload
 from cfx_report.runs import read_runs
 from tests.broken_plugins import QUICK
 from tests.job_folders import write_job

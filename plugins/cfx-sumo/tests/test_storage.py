@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from cfx.app import cli
-from cfx.app.job.results import Upload
+from cfx.results.folder import Upload
 from tests.job_folders import write_job
 
 pytest.importorskip("moto", reason="moto stands in for S3")

@@ -208,7 +208,7 @@ def test_full_trajectories_belong_to_training() -> None:
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
+def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.plugin.Result:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("across"))
         platoons = "data.platoon_size=4"  # drivers follow one another across folds
@@ -216,7 +216,7 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
         return cfx.run([*QUICK, platoons, *across])
 
 
-def test_all_methods_are_simulated_over_the_same_frames(result: cfx.JobResult) -> None:
+def test_all_methods_are_simulated_over_the_same_frames(result: cfx.plugin.Result) -> None:
     methods = ["default", "population", "fixed", "policy"]
     assert result.pairs.groupby("pair_id")["method"].apply(list).tolist() == [methods] * 6
     by_pair = result.pairs.groupby("pair_id")[["frames", "fold"]]
@@ -228,7 +228,7 @@ def test_all_methods_are_simulated_over_the_same_frames(result: cfx.JobResult) -
     assert len(set(population["parameter_t_r"])) > 1
 
 
-def test_every_baseline_has_its_improvement(result: cfx.JobResult) -> None:
+def test_every_baseline_has_its_improvement(result: cfx.plugin.Result) -> None:
     policy = result.pairs[result.pairs.method == "policy"].set_index("pair_id")
     for baseline, key in (
         ("fixed", "rmse_improvement"),
@@ -254,13 +254,13 @@ def test_every_baseline_has_its_improvement(result: cfx.JobResult) -> None:
     assert "full_trajectory/rmse_speed/fixed" not in result.metrics
 
 
-def test_the_design_is_written_down(result: cfx.JobResult) -> None:
+def test_the_design_is_written_down(result: cfx.plugin.Result) -> None:
     notes = json.loads((result.folder / "data.json").read_text())["protocol"]
     assert (notes["folds"], notes["drivers"], notes["drivers_per_fold"]) == (3, 6, [2, 2, 2])
     assert 0 < notes["test_pairs_behind_a_training_driver"] <= 6
 
 
-def test_trajectories_and_curves_are_kept(result: cfx.JobResult) -> None:
+def test_trajectories_and_curves_are_kept(result: cfx.plugin.Result) -> None:
     drives = pd.read_parquet(result.folder / "trajectories.parquet")
     row = result.pairs[(result.pairs.method == "population")].iloc[0]
     own = drives[drives.pair_id == row.pair_id].iloc[1:]
@@ -278,7 +278,7 @@ def test_trajectories_and_curves_are_kept(result: cfx.JobResult) -> None:
     )
 
 
-def test_the_saved_policy_drives_unseen_drivers(result: cfx.JobResult) -> None:
+def test_the_saved_policy_drives_unseen_drivers(result: cfx.plugin.Result) -> None:
     policy = cfx.load(result.folder).policy
     unseen = SyntheticDataset(pairs=2, frames=100, seed=9).load()
     assert policy.networks_for(unseen).tolist() == [3, 3]
@@ -337,7 +337,7 @@ def test_too_few_long_pairs_are_refused() -> None:
         AcrossDrivers(min_test_duration=500).folds(chained(("1", "2"), ("2", "3")), seed=0)
 
 
-def rollout(folder: Path, *changes: str) -> cfx.JobResult:
+def rollout(folder: Path, *changes: str) -> cfx.plugin.Result:
     small = [
         "learner=rollout",
         "learner.ensemble_size=2",
@@ -350,14 +350,14 @@ def rollout(folder: Path, *changes: str) -> cfx.JobResult:
 
 
 @pytest.fixture(scope="module")
-def learned(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
+def learned(tmp_path_factory: pytest.TempPathFactory) -> cfx.plugin.Result:
     """A job that learns by rollout, and compares amounts of history."""
     folder = tmp_path_factory.mktemp("rollout") / "one"
     return rollout(folder, "protocol.histories=[0,5]", "data.platoon_size=4")
 
 
 def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(
-    learned: cfx.JobResult,
+    learned: cfx.plugin.Result,
 ) -> None:
     history = pd.read_parquet(learned.folder / "history.parquet")
     assert set(history["base"]) == {"own", "population"}
@@ -383,7 +383,7 @@ def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(
     } <= learned.metrics.keys()
 
 
-def test_less_history_is_what_the_plot_says(learned: cfx.JobResult, tmp_path: Path) -> None:
+def test_less_history_is_what_the_plot_says(learned: cfx.plugin.Result, tmp_path: Path) -> None:
     none = ["protocol.history=0", "protocol.histories=[]"]
     other = rollout(tmp_path / "other", *none, "data.platoon_size=4")
     history = pd.read_parquet(learned.folder / "history.parquet")

@@ -18,11 +18,10 @@ from cfx.data.pairs import PairBatch
 from cfx.data.tidy import TidyDataset
 from cfx.errors import ConfigError, DataError
 from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
-from cfx.evaluation.result import Array
+from cfx.evaluation.result import Array, Evaluation
 from cfx.policies.checkpoint import load_agent
 from cfx.policies.context import ExpectedError, conformal_bound
 from cfx.policies.ready import folder_of_ready_made
-from cfx.results.table import Findings
 from cfx.results.tables import Past
 
 QUICK = [
@@ -162,10 +161,10 @@ def test_drivers_unlike_those_learned_from_are_counted() -> None:
         unlike=[0.5, 3.5, 4.0, 2.9, np.nan],
         unlike_in=["acceleration", "time_gap", "time_gap", "acceleration", ""],
     )
-    findings = cast(Findings, SimpleNamespace(evaluation=SimpleNamespace(tables={"past": table})))
-    metrics = Past().metrics(findings)
+    evaluation = cast(Evaluation, SimpleNamespace(tables={"past": table}))
+    metrics = Past().metrics(evaluation)
     assert metrics["past/unlike"] == 0.5
-    words = " ".join(Past().console(findings, metrics))
+    words = " ".join(Past().console(evaluation, metrics))
     assert (
         "2 of 4 drivers drive unlike those that it learned from, most often in their time gap"
         in words

@@ -79,20 +79,22 @@ def store(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def one_for_all(tmp_path_factory: pytest.TempPathFactory, store: list[str]) -> cfx.JobResult:
+def one_for_all(tmp_path_factory: pytest.TempPathFactory, store: list[str]) -> cfx.plugin.Result:
     """A tracked job without a population, whose policy answers parameters."""
     folder = tmp_path_factory.mktemp("jobs") / "one"
     return cfx.run([*TRAINED, "protocol.networks=all", f"hydra.run.dir={folder}", *store])
 
 
 @pytest.fixture(scope="module")
-def of_all(tmp_path_factory: pytest.TempPathFactory, one_for_all: cfx.JobResult) -> cfx.JobResult:
+def of_all(
+    tmp_path_factory: pytest.TempPathFactory, one_for_all: cfx.plugin.Result
+) -> cfx.plugin.Result:
     """A job that drives its policy."""
     return transferred(one_for_all.folder, tmp_path_factory.mktemp("of all"))
 
 
 @pytest.fixture(scope="module")
-def moved(tmp_path_factory: pytest.TempPathFactory, unseen: Path) -> cfx.JobResult:
+def moved(tmp_path_factory: pytest.TempPathFactory, unseen: Path) -> cfx.plugin.Result:
     """A job in which a policy drives that knows nothing of its drivers."""
     return transferred(unseen, tmp_path_factory.mktemp("moved"))
 
@@ -110,12 +112,12 @@ def elsewhere(seed: int = 9) -> PairSet:
     return SyntheticDataset(pairs=3, platoon_size=1, frames=200, seed=seed).load()
 
 
-def transferred(run: Path, tmp_path: Path, *overrides: str) -> cfx.JobResult:
+def transferred(run: Path, tmp_path: Path, *overrides: str) -> cfx.plugin.Result:
     return cfx.run([*HERE, f"protocol.run={run}", f"hydra.run.dir={tmp_path / 'job'}", *overrides])
 
 
 def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
-    unseen: Path, moved: cfx.JobResult
+    unseen: Path, moved: cfx.plugin.Result
 ) -> None:
     result = moved
     policy = checkpoint.load_agent(unseen / "policy")
@@ -142,7 +144,7 @@ def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
 
 
 def test_it_starts_from_drivers_own_parameters_where_it_learned_so(
-    known: Path, moved: cfx.JobResult, tmp_path: Path
+    known: Path, moved: cfx.plugin.Result, tmp_path: Path
 ) -> None:
     """They are those of the model alone, also where the policy has a residual."""
     metrics = transferred(known, tmp_path / "known").metrics
@@ -170,7 +172,7 @@ def test_model_policy_and_windows_are_those_it_was_trained_with_and_drivers_of_t
 
 
 def test_the_job_may_be_named_by_its_mlflow_run(
-    one_for_all: cfx.JobResult, of_all: cfx.JobResult, store: list[str], tmp_path: Path
+    one_for_all: cfx.plugin.Result, of_all: cfx.plugin.Result, store: list[str], tmp_path: Path
 ) -> None:
     run = one_for_all.run_id
     named = cfx.run([*HERE, f"protocol.run={run}", f"hydra.run.dir={tmp_path / 'by id'}", *store])
@@ -183,7 +185,7 @@ def test_the_job_may_be_named_by_its_mlflow_run(
 
 
 def test_without_a_population_the_default_is_the_only_baseline_for_unseen_drivers(
-    of_all: cfx.JobResult,
+    of_all: cfx.plugin.Result,
 ) -> None:
     result = of_all
     assert set(result.pairs.method) == {"default", "fixed", "policy"}
@@ -260,7 +262,7 @@ def test_runs_that_have_no_policy_for_others_are_refused(tmp_path: Path) -> None
 
 
 def test_a_job_that_drives_a_saved_policy_hands_it_on(
-    unseen: Path, moved: cfx.JobResult, tmp_path: Path
+    unseen: Path, moved: cfx.plugin.Result, tmp_path: Path
 ) -> None:
     twice = transferred(moved.folder, tmp_path)
     pd.testing.assert_frame_equal(twice.pairs, moved.pairs)

@@ -17,7 +17,7 @@ from cfx.plugin import (
     Array,
     JobFigure,
     Line,
-    Results,
+    Result,
     canvas,
     draw_lines,
     mark_points,
@@ -267,13 +267,13 @@ class TrafficFigure(JobFigure):
     )
     order = 120
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where traffic was simulated."""
-        roads = results.tables.get("traffic")
-        growth, strips = results.tables.get("traffic_growth"), results.tables.get("traffic_strips")
+        roads = result.tables.get("traffic")
+        growth, strips = result.tables.get("traffic_growth"), result.tables.get("traffic_strips")
         if roads is None or growth is None or strips is None:
             return None
-        real = results.metrics.get(f"traffic/wave_speed/{RECORDED}", math.nan)
+        real = result.metrics.get(f"traffic/wave_speed/{RECORDED}", math.nan)
         methods = traffic_methods(roads)
         return draw_traffic(traffic_panels(roads, growth, strips, real, methods), methods)
 
@@ -285,9 +285,9 @@ class TrafficPaths(JobFigure):
     caption = "A panel per method; a point is a vehicle at a moment, its colour is its speed."
     order = 121
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where paths were kept."""
-        paths, roads = results.tables.get("traffic_paths"), results.tables.get("traffic")
+        paths, roads = result.tables.get("traffic_paths"), result.tables.get("traffic")
         if paths is None or roads is None or not len(paths):
             return None
         return draw_paths(path_panels(paths, traffic_methods(roads)))

@@ -9,7 +9,7 @@ from typing import Any
 
 import pandas as pd
 
-from cfx.plugin import RECORDED, Job, key_of
+from cfx.plugin import RECORDED, Result, key_of
 from cfx_forecasts.traffic.summary import traffic_methods
 from cfx_report.jobs import Runs
 from cfx_report.section import Cell, Column, Section, Sheet, method_cell, methods_explained, number
@@ -94,7 +94,7 @@ that keep their speed: what vehicles add by themselves.</p>
         return {"roads": found, "methods": methods_explained(methods)} if found else None
 
 
-def traffic_sheet(job: Job, roads: pd.DataFrame) -> Sheet:
+def traffic_sheet(job: Result, roads: pd.DataFrame) -> Sheet:
     """Returns a row per method, and the recorded drivers.
 
     Args:
@@ -107,5 +107,5 @@ def traffic_sheet(job: Job, roads: pd.DataFrame) -> Sheet:
     return Sheet.of(columns, (*traffic_methods(roads), RECORDED))
 
 
-def _measure(job: Job, metric: str, form: str, method: str) -> Cell:
+def _measure(job: Result, metric: str, form: str, method: str) -> Cell:
     return number(job.metrics.get(key_of(f"traffic/{metric}", method), math.nan), form)

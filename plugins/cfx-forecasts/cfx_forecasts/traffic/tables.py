@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping
 
 from rich.table import Table
 
-from cfx.plugin import RECORDED, Column, Findings, ResultTable, metrics_table
+from cfx.plugin import RECORDED, Column, Evaluation, ResultTable, metrics_table
 from cfx_forecasts.traffic.summary import traffic_methods, traffic_metrics
 
 METHOD = Column("method", "", "what drives", "text")
@@ -44,9 +44,9 @@ class Roads(ResultTable):
         Column("outside", "1", "share of windows outside what the policy has learned from"),
     )
 
-    def metrics(self, findings: Findings) -> Mapping[str, float]:
-        tables = findings.evaluation.tables
-        speed = findings.protocol_result.notes["traffic"]["recorded_wave_speed_kmh"]
+    def metrics(self, evaluation: Evaluation) -> Mapping[str, float]:
+        tables = evaluation.tables
+        speed = evaluation.notes["traffic"]["recorded_wave_speed_kmh"]
         return traffic_metrics(
             tables["traffic"],
             tables["traffic_growth"],
@@ -54,9 +54,9 @@ class Roads(ResultTable):
             math.nan if speed is None else speed,
         )
 
-    def console(self, findings: Findings, metrics: Mapping[str, float]) -> Iterable[Table]:
+    def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[Table]:
         title = "Traffic: rings in vehicles/h, m/s and km/h; platoons in m/s; collisions"
-        methods = traffic_methods(findings.evaluation.tables["traffic"])
+        methods = traffic_methods(evaluation.tables["traffic"])
         return [metrics_table(title, (*methods, RECORDED), _SHOWN, metrics)]
 
 

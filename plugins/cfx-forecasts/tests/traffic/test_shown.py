@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.figures.figure import Results, draw_figure, figure_named
+from cfx.figures.drawing import draw_figure, figure_named
 from cfx.figures.text import MINUS, colour_of, method_label
+from cfx.results.result import Result
 from cfx_forecasts.traffic.figures import draw_paths, draw_traffic, path_panels, traffic_panels
 from cfx_forecasts.traffic.section import traffic_sheet
 from cfx_forecasts.traffic.summary import traffic_methods, traffic_metrics
@@ -110,5 +111,5 @@ def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
 def test_each_figure_is_drawn_where_there_is_traffic_and_nowhere_else(name: str) -> None:
     one = figure_named(name)
     evaluation = make_results(pairs=3, frames=20).evaluation
-    assert draw_figure(one, Results.of(evaluation)) is None
-    assert draw_figure(one, Results.of(evaluation, tables=make_traffic())) is not None
+    assert draw_figure(one, Result.of(evaluation)) is None
+    assert draw_figure(one, Result.of(evaluation, tables=make_traffic())) is not None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import json
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pandas as pd
@@ -14,8 +13,6 @@ from rich.console import Console
 
 import cfx
 from cfx.errors import CfxError
-from cfx.evaluation.protocols.base import ProtocolResult
-from cfx.results.table import Findings
 from cfx_forecasts.traffic.summary import TRAFFIC_METHODS
 from cfx_forecasts.traffic.tables import (
     GROWTH_COLUMNS,
@@ -45,13 +42,13 @@ CONSTANT = {"population", "population_ar", "fixed", "fixed_ar"}
 
 
 @pytest.fixture(scope="module")
-def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.JobResult:
+def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.plugin.Result:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(tmp_path_factory.mktemp("traffic"))
         return cfx.run([*TRAFFIC, "policy=fixed"])
 
 
-def test_every_method_drives_on_every_road(result: cfx.JobResult) -> None:
+def test_every_method_drives_on_every_road(result: cfx.plugin.Result) -> None:
     roads = pd.read_parquet(result.folder / "traffic.parquet")
     assert list(roads.columns) == list(ROAD_COLUMNS)
     assert set(roads["method"]) == CONSTANT <= set(TRAFFIC_METHODS)
@@ -66,7 +63,7 @@ def test_every_method_drives_on_every_road(result: cfx.JobResult) -> None:
     assert notes["vehicles"] == 4 * 6 + round(1200 * 40 / 3600) + 2 * 4
 
 
-def test_traffic_stands_in_every_table(result: cfx.JobResult) -> None:
+def test_traffic_stands_in_every_table(result: cfx.plugin.Result) -> None:
     growth = pd.read_parquet(result.folder / "traffic_growth.parquet")
     strips = pd.read_parquet(result.folder / "traffic_strips.parquet")
     paths = pd.read_parquet(result.folder / "traffic_paths.parquet")
@@ -85,14 +82,8 @@ def test_traffic_stands_in_every_table(result: cfx.JobResult) -> None:
     rings = roads[(roads["method"] == "fixed") & (roads["road"] == "ring")]
     capacity = rings.groupby("level")["flow"].mean().max()
     assert result.metrics["traffic/capacity/fixed"] == pytest.approx(capacity)
-    assert result.evaluation is not None
     console = Console(file=io.StringIO(), width=80)
-    findings = Findings(
-        cfx.plugin.PairSet((), ""),
-        cast(Any, None),
-        ProtocolResult(result.evaluation, result.policy, pd.DataFrame(), None),
-    )
-    console.print(*Roads().console(findings, result.metrics))
+    console.print(*Roads().console(result.evaluation, result.metrics))
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
     assert f"{capacity:.0f}" in shown
@@ -100,7 +91,7 @@ def test_traffic_stands_in_every_table(result: cfx.JobResult) -> None:
 
 
 def test_the_same_seed_gives_the_same_traffic(
-    result: cfx.JobResult, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    result: cfx.plugin.Result, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
     again = cfx.run([*TRAFFIC, "policy=fixed"])

@@ -19,7 +19,7 @@ from cfx.plugin import (
     Array,
     JobFigure,
     ParameterAxis,
-    Results,
+    Result,
     canvas,
     colour_of,
     draw_points,
@@ -219,12 +219,12 @@ class Calibration(JobFigure):
     )
     order = 70
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where drivers have parameters of their own."""
-        spreads = parameter_spreads(results.pairs, results.parameters)
+        spreads = parameter_spreads(result.pairs, result.parameters)
         if not spreads:
             return None
-        table = correlations(results.pairs, [spread.axis for spread in spreads])
+        table = correlations(result.pairs, [spread.axis for spread in spreads])
         return draw_calibration(spreads, table)
 
 
@@ -477,12 +477,12 @@ class Slices(JobFigure):
     )
     order = 130
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where the loss was examined."""
-        table = results.tables.get("slices")
+        table = result.tables.get("slices")
         if table is None:
             return None
-        panels = slice_panels(table, results.parameters)
+        panels = slice_panels(table, result.parameters)
         return draw_slices(panels) if panels else None
 
 
@@ -497,9 +497,9 @@ class FitTrainTest(JobFigure):
     )
     order = 131
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where errors on both parts are known."""
-        table = results.tables.get("fits")
+        table = result.tables.get("fits")
         found = {} if table is None else fits_of(table)
         return draw_fits(found) if found else None
 
@@ -515,13 +515,13 @@ class LabelsOverTime(JobFigure):
     )
     order = 132
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where windows were calibrated."""
-        table = results.tables.get("labels")
+        table = result.tables.get("labels")
         if table is None:
             return None
-        drivers = labels_of(table, results.pairs, results.parameters)
+        drivers = labels_of(table, result.pairs, result.parameters)
         if not drivers:
             return None
         pair_id = list(drivers)[len(drivers) // 2]
-        return draw_labels(pair_id, drivers[pair_id], results.parameters)
+        return draw_labels(pair_id, drivers[pair_id], result.parameters)

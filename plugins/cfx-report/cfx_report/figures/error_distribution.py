@@ -13,7 +13,7 @@ from cfx.plugin import (
     DASHES,
     HIDDEN,
     JobFigure,
-    Results,
+    Result,
     canvas,
     colour_of,
     finite,
@@ -66,9 +66,9 @@ class ErrorDistribution(JobFigure):
     )
     order = 41
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where several pairs were driven by calibrated parameters or a policy."""
-        methods = [method for method in results.methods if method not in HIDDEN]
-        if results.pairs["pair_id"].nunique() < _FEWEST or set(methods) <= {"default"}:
+        methods = [method for method in result.shown_methods if method not in HIDDEN]
+        if result.pairs["pair_id"].nunique() < _FEWEST or set(methods) <= {"default"}:
             return None
-        return draw_error_distribution(results.pairs, methods)
+        return draw_error_distribution(result.pairs, methods)

@@ -12,7 +12,7 @@ from cfx.plugin import (
     HIDDEN,
     JobFigure,
     PairTrajectory,
-    Results,
+    Result,
     canvas,
     colour_of,
     method_legend,
@@ -71,13 +71,13 @@ class Following(JobFigure):
     )
     order = 31
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where trajectories are known."""
-        if not len(results.trajectories):
+        if not len(result.trajectories):
             return None
         methods = []
-        for method in results.methods:
-            if method in results.trajectories[0].speed and method not in HIDDEN:
+        for method in result.shown_methods:
+            if method in result.trajectories[0].speed and method not in HIDDEN:
                 methods.append(method)
-        pairs = [trajectory for _, trajectory in chosen_pairs(results, None, _PAIRS)]
+        pairs = [trajectory for _, trajectory in chosen_pairs(result, None, _PAIRS)]
         return draw_following(pairs, methods)

@@ -12,7 +12,7 @@ from matplotlib.ticker import MaxNLocator
 from cfx.plugin import (
     DASHES,
     JobFigure,
-    Results,
+    Result,
     canvas,
     colour_of,
     legend_above,
@@ -95,7 +95,7 @@ class ParameterHistograms(JobFigure):
     )
     order = 71
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where drivers have parameters of their own."""
-        spreads = parameter_spreads(results.pairs, results.parameters)
+        spreads = parameter_spreads(result.pairs, result.parameters)
         return draw_histograms(spreads) if spreads else None

@@ -19,7 +19,7 @@ from cfx.plugin import (
     Dash,
     Improvement,
     JobFigure,
-    Results,
+    Result,
     canvas,
     common_prefix,
     finite,
@@ -306,17 +306,17 @@ class ImprovementPerDriver(JobFigure):
     )
     order = 10
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where a policy adapts."""
-        if "fixed" not in results.improvements:
+        if "fixed" not in result.improvements:
             return None
-        return draw_improvement(results, "fixed", "improvement")
+        return draw_improvement(result, "fixed", "improvement")
 
 
-def draw_improvement(results: Results, baseline: str, column: str) -> Figure:
+def draw_improvement(result: Result, baseline: str, column: str) -> Figure:
     """Draws the improvement of every pair over a baseline, which `column` of the pairs holds."""
-    rows = results.pairs[results.pairs["method"] == "policy"]
-    summary = results.improvements[baseline]
+    rows = result.pairs[result.pairs["method"] == "policy"]
+    summary = result.improvements[baseline]
     bars = improvement_bars(
         [""],
         [rows["pair_id"].astype(str).tolist()],
@@ -421,9 +421,9 @@ class History(JobFigure):
     )
     order = 100
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where the history was varied."""
-        table = results.tables.get("history")
+        table = result.tables.get("history")
         if table is None:
             return None
         return draw_history(table)

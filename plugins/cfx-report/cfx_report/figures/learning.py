@@ -13,7 +13,7 @@ from cfx.plugin import (
     VALIDATION_COLOUR,
     Array,
     JobFigure,
-    Results,
+    Result,
     canvas,
     first_sampled_epoch,
     legend_above,
@@ -131,9 +131,9 @@ class LearningCurve(JobFigure):
     )
     order = 80
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where something was learned."""
-        table = results.tables.get("curves")
+        table = result.tables.get("curves")
         if table is None or not len(table):
             return None
         return draw_learning(table)

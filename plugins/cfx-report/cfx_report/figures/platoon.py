@@ -16,7 +16,7 @@ from cfx.plugin import (
     COLOURS,
     Array,
     JobFigure,
-    Results,
+    Result,
     canvas,
     finite,
     key_of,
@@ -176,18 +176,18 @@ class PlatoonSpeeds(JobFigure):
     )
     order = 90
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where platoons were simulated."""
-        table = results.tables.get("platoon")
+        table = result.tables.get("platoon")
         if table is None:
             return None
         present = set(table["method"])
-        methods = [method for method in results.methods if method in present]
+        methods = [method for method in result.shown_methods if method in present]
         if not methods:
             return None
         stable = {}
         for method in methods:
-            share = results.metrics.get(key_of("platoon/string_stable", method))
+            share = result.metrics.get(key_of("platoon/string_stable", method))
             if share is not None:
                 stable[method] = share
         return draw_platoons(table, methods, stable)

@@ -18,7 +18,7 @@ from cfx.plugin import (
     MIN_NARROWING,
     JobFigure,
     ParameterAxis,
-    Results,
+    Result,
     are_reliable,
     canvas,
     colour_of,
@@ -248,13 +248,13 @@ class PosteriorIntervals(JobFigure):
     )
     order = 133
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where the job has a posterior."""
-        fits = results.tables.get("fits")
+        fits = result.tables.get("fits")
         if fits is None:
             return None
         rows = interval_rows(fits)
-        axes = [axis for axis in results.parameters if f"median_{axis.name}" in rows]
+        axes = [axis for axis in result.parameters if f"median_{axis.name}" in rows]
         return draw_intervals(rows, axes) if len(rows) and axes else None
 
 
@@ -270,15 +270,15 @@ class PosteriorPairs(JobFigure):
     )
     order = 134
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where the job has a posterior."""
-        fits, draws = results.tables.get("fits"), results.tables.get("posterior")
+        fits, draws = result.tables.get("fits"), result.tables.get("posterior")
         if fits is None or draws is None or interval_rows(fits).empty:
             return None
         pair_id = _middle(interval_rows(fits))
         own = draws[draws["pair_id"].astype(str) == pair_id]
-        axes = [axis for axis in results.parameters if f"parameter_{axis.name}" in own]
-        prior = results.tables.get("population", results.tables.get("prior"))
+        axes = [axis for axis in result.parameters if f"parameter_{axis.name}" in own]
+        prior = result.tables.get("population", result.tables.get("prior"))
         return draw_pairs(pair_id, own, axes, prior) if len(own) and axes else None
 
 
@@ -293,9 +293,9 @@ class PosteriorFan(JobFigure):
     )
     order = 135
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where the job has a posterior."""
-        fits, fan = results.tables.get("fits"), results.tables.get("fan")
+        fits, fan = result.tables.get("fits"), result.tables.get("fan")
         if fits is None or fan is None or interval_rows(fits).empty:
             return None
         pair_id = _middle(interval_rows(fits))

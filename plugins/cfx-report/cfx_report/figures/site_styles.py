@@ -18,7 +18,7 @@ from cfx.plugin import (
     Array,
     Group,
     JobFigure,
-    Results,
+    Result,
     StyleResult,
     canvas,
     groups,
@@ -155,8 +155,8 @@ class SiteStyles(JobFigure):
     )
     order = 61
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where drivers of several sites are scored."""
-        if results.style is None or not groups(results.style.table):
+        if result.style is None or not groups(result.style.table):
             return None
-        return draw_site_styles(results.style, results.tables.get("style_distances"))
+        return draw_site_styles(result.style, result.tables.get("style_distances"))

@@ -13,7 +13,7 @@ from cfx.plugin import (
     COLOURS,
     INK,
     JobFigure,
-    Results,
+    Result,
     canvas,
     hover,
     method_label,
@@ -105,7 +105,7 @@ class SiteImprovements(JobFigure):
     )
     order = 15
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where several sites were tested."""
-        table = results.tables.get("sites")
+        table = result.tables.get("sites")
         return None if table is None else draw_sites(table)

@@ -15,7 +15,7 @@ from cfx.plugin import (
     INK,
     Array,
     JobFigure,
-    Results,
+    Result,
     StyleResult,
     canvas,
     finite,
@@ -118,6 +118,6 @@ class StyleDistribution(JobFigure):
     )
     order = 60
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where scores are known."""
-        return None if results.style is None else draw_style(results.style)
+        return None if result.style is None else draw_style(result.style)

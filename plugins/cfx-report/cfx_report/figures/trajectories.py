@@ -27,7 +27,7 @@ from cfx.plugin import (
     Line,
     PairTrajectory,
     ParameterAxis,
-    Results,
+    Result,
     canvas,
     colour_of,
     draw_lines,
@@ -288,14 +288,14 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
 
 
 @styled
-def draw_pair(results: Results, pair_id: str) -> Figure:
+def draw_pair(result: Result, pair_id: str) -> Figure:
     """Draws speed, gap and each tuned parameter of one pair over the test part.
 
     Raises:
         ConfigError: the pair id is not in the results.
     """
-    ((_, trajectory),) = chosen_pairs(results, pair_id, 1)
-    pair = pair_panels(trajectory, results.methods, results.parameters)
+    ((_, trajectory),) = chosen_pairs(result, pair_id, 1)
+    pair = pair_panels(trajectory, result.shown_methods, result.parameters)
     columns = max(2, most_across(2 if len(pair.parameters) <= 4 else 4))
     rows = -(-len(pair.parameters) // columns)
     figure = canvas(3.4 + 1.75 * rows)
@@ -305,7 +305,7 @@ def draw_pair(results: Results, pair_id: str) -> Figure:
     draw_panel(speeds, pair.speed)
     draw_panel(gaps, pair.gap)
     _draw_parameters(speeds, grid, pair.parameters, first=columns)
-    _finish(figure, results.methods)
+    _finish(figure, result.shown_methods)
     return figure
 
 
@@ -422,7 +422,7 @@ def _write_note(axes: Axes, text: str, *, above: bool) -> None:
     )
 
 
-def drives(results: Results, pair_id: str | Sequence[str] | None = None, count: int = 3) -> Figure:
+def drives(result: Result, pair_id: str | Sequence[str] | None = None, count: int = 3) -> Figure:
     """Speed and gap over the test part, a row per pair.
 
     Args:
@@ -436,17 +436,17 @@ def drives(results: Results, pair_id: str | Sequence[str] | None = None, count: 
     """
     titles, panels = [], []
     explained: str | None = None
-    for ranked, trajectory in chosen_pairs(results, pair_id, count):
+    for ranked, trajectory in chosen_pairs(result, pair_id, count):
         name = RankedPair(shortened(ranked.pair_id), ranked.rank, ranked.improvement).title
         if np.isfinite(ranked.improvement):
             name += f":  {percent(ranked.improvement)}"
             explained = f"percentages: {improvement_title('fixed')}"
-        elif {"fixed", "policy"} <= set(results.methods):
+        elif {"fixed", "policy"} <= set(result.shown_methods):
             name += ":  improvement undefined"
-        speed = _errors_text(results, trajectory.pair_id, "speed", "m/s")
-        titles.append((name, speed, _errors_text(results, trajectory.pair_id, "gap", "m")))
-        panels.append(pair_panels(trajectory, results.methods, results.parameters))
-    return draw_pairs(titles, panels, results.methods, explained)
+        speed = _errors_text(result, trajectory.pair_id, "speed", "m/s")
+        titles.append((name, speed, _errors_text(result, trajectory.pair_id, "gap", "m")))
+        panels.append(pair_panels(trajectory, result.shown_methods, result.parameters))
+    return draw_pairs(titles, panels, result.shown_methods, explained)
 
 
 class Drives(JobFigure):
@@ -456,9 +456,9 @@ class Drives(JobFigure):
     caption = "The test part of three pairs, simulated behind the recorded leader by each method."
     order = 20
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where trajectories are known."""
-        return drives(results) if len(results.trajectories) else None
+        return drives(result) if len(result.trajectories) else None
 
 
 class Speeds(JobFigure):
@@ -468,13 +468,13 @@ class Speeds(JobFigure):
     caption = "The test part of the pair in the middle, a panel per method."
     order = 30
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where trajectories are known."""
-        if not len(results.trajectories):
+        if not len(result.trajectories):
             return None
-        ((_, trajectory),) = chosen_pairs(results, None, 1)
-        errors = _errors(results, trajectory.pair_id, "speed")
-        return draw_speeds(trajectory, results.methods, errors)
+        ((_, trajectory),) = chosen_pairs(result, None, 1)
+        errors = _errors(result, trajectory.pair_id, "speed")
+        return draw_speeds(trajectory, result.shown_methods, errors)
 
 
 class ChosenParameters(JobFigure):
@@ -484,17 +484,17 @@ class ChosenParameters(JobFigure):
     caption = "The test part of the pair in the middle; what lies outside the bounds is shaded."
     order = 50
 
-    def draw(self, results: Results) -> Figure | None:
+    def draw(self, result: Result) -> Figure | None:
         """Draws it where trajectories are known."""
-        if not len(results.trajectories):
+        if not len(result.trajectories):
             return None
-        ((_, trajectory),) = chosen_pairs(results, None, 1)
-        pair = pair_panels(trajectory, results.methods, results.parameters)
-        return draw_parameters(pair, results.methods)
+        ((_, trajectory),) = chosen_pairs(result, None, 1)
+        pair = pair_panels(trajectory, result.shown_methods, result.parameters)
+        return draw_parameters(pair, result.shown_methods)
 
 
 def chosen_pairs(
-    results: Results, pair_id: str | Sequence[str] | None, count: int
+    result: Result, pair_id: str | Sequence[str] | None, count: int
 ) -> list[tuple[RankedPair, PairTrajectory]]:
     """Returns the pairs that a figure shows, with their test parts.
 
@@ -506,12 +506,12 @@ def chosen_pairs(
     Raises:
         ConfigError: a pair id is not in the results.
     """
-    by_id = {trajectory.pair_id: trajectory for trajectory in results.trajectories}
-    is_calibration = "policy" not in results.methods
+    by_id = {trajectory.pair_id: trajectory for trajectory in result.trajectories}
+    is_calibration = "policy" not in result.shown_methods
     judged = "policy"
     if is_calibration:  # the drivers' own constant set, which stands last, if there is one
-        judged = [method for method in results.methods if method not in HIDDEN][-1]
-    rows = results.pairs[results.pairs["method"] == judged]
+        judged = [method for method in result.shown_methods if method not in HIDDEN][-1]
+    rows = result.pairs[result.pairs["method"] == judged]
     rows = rows[rows["pair_id"].isin(list(by_id))]
     gains = pd.Series(np.nan, index=rows["pair_id"].astype(str))
     # Without driver-specific calibration there is nothing to be better than.
@@ -535,17 +535,17 @@ def chosen_pairs(
     return chosen
 
 
-def _errors(results: Results, pair_id: str, signal: str) -> dict[str, float]:
+def _errors(result: Result, pair_id: str, signal: str) -> dict[str, float]:
     """Returns the RMSE of a signal of one pair by method, in the methods' order."""
-    rows = results.pairs[results.pairs["pair_id"] == pair_id].drop_duplicates("method")
+    rows = result.pairs[result.pairs["pair_id"] == pair_id].drop_duplicates("method")
     errors = rows.set_index("method")[f"rmse_{signal}"]
-    return {method: float(errors[method]) for method in results.methods if method in errors}
+    return {method: float(errors[method]) for method in result.shown_methods if method in errors}
 
 
-def _errors_text(results: Results, pair_id: str, signal: str, unit: str) -> str:
+def _errors_text(result: Result, pair_id: str, signal: str, unit: str) -> str:
     """Returns a title such as "RMSE of speed (m/s): default 1.02, policy 0.31"."""
     listed = []
-    for method, error in _errors(results, pair_id, signal).items():
+    for method, error in _errors(result, pair_id, signal).items():
         if method not in HIDDEN:
             value = f"{error:.2f}" if np.isfinite(error) else "none"
             listed.append(f"{short_label(method)} {value}")

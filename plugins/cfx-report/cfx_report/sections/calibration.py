@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.plugin import NEARLY_BEST, Job, Purpose, shortened, unit_label
+from cfx.plugin import NEARLY_BEST, Purpose, Result, shortened, unit_label
 from cfx.plugin import number_text as shown
 from cfx_report.figures.calibration import (
     AT_BOUND,
@@ -54,7 +54,7 @@ class CalibrationSection(Section):
 
     def context(self, runs: Runs) -> Mapping[str, Any] | None:
         """Return each calibration with the jobs that share it."""
-        together: dict[str, list[Job]] = {}
+        together: dict[str, list[Result]] = {}
         for job in of_purpose(runs.jobs, Purpose.ADAPTATION, Purpose.CALIBRATION):
             spreads = spreads_of(job)
             if spreads:
@@ -67,12 +67,12 @@ class CalibrationSection(Section):
         return {"calibrations": found} if found else None
 
 
-def _labels(jobs: Sequence[Job]) -> dict[str, View]:
+def _labels(jobs: Sequence[Result]) -> dict[str, View]:
     """Returns the per-window parameters of some pairs of the first job that has kept any."""
     for job in jobs:
         views = {}
         if "labels" in job.tables:
-            axes = job.results.parameters
+            axes = job.parameters
             drivers = labels_of(job.tables["labels"], job.pairs, axes)
             for pair_id, labels in drivers.items():
                 views[shortened(pair_id)] = View(draw_labels(pair_id, labels, axes))
@@ -81,14 +81,14 @@ def _labels(jobs: Sequence[Job]) -> dict[str, View]:
     return {}
 
 
-def slices_of(job: Job) -> tuple[SlicePanel, ...]:
+def slices_of(job: Result) -> tuple[SlicePanel, ...]:
     """Returns the loss along each tuned parameter of a job; () if it has kept none."""
     if "slices" not in job.tables:
         return ()
     return slice_panels(job.tables["slices"], job.parameters)
 
 
-def spreads_of(job: Job) -> tuple[ParameterSpread, ...]:
+def spreads_of(job: Result) -> tuple[ParameterSpread, ...]:
     """Returns the spread of each tuned parameter of a job."""
     return parameter_spreads(job.pairs, job.parameters)
 

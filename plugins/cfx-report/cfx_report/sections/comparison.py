@@ -16,9 +16,9 @@ from cfx.plugin import (
     METHODS,
     STEADY,
     TEST,
-    Job,
     MetricInfo,
     Purpose,
+    Result,
     explained,
     finite,
     percent,
@@ -95,7 +95,7 @@ _GAINS = (
     ("population", FULL_TRAJECTORY),
 )
 
-_JOB = Column[Job]("Job", lambda job: job.name)
+_JOB = Column[Result]("Job", lambda job: job.name)
 
 
 class ComparisonSection(Section):
@@ -145,7 +145,7 @@ upper reference for the models that follow.</p>
         }
 
 
-def closeness(jobs: Sequence[Job]) -> Sheet:
+def closeness(jobs: Sequence[Result]) -> Sheet:
     """Returns a row per job: the errors of each method, and the policy's improvement."""
     frames = {
         TEST: tested(jobs),
@@ -157,7 +157,7 @@ def closeness(jobs: Sequence[Job]) -> Sheet:
         (FULL_TRAJECTORY, "Full trajectories: the same"),
     ):
         for method in METHODS:
-            showing = [job for job in jobs if method in job.meaningful_methods]
+            showing = [job for job in jobs if method in job.shown_methods]
             if any_has_metric(showing, "rmse_speed", method, scope):
                 meaning = f"RMSE over {frames[scope]}, with {explained(method)}."
                 cell = partial(_error, scope=scope, method=method)
@@ -175,7 +175,7 @@ def closeness(jobs: Sequence[Job]) -> Sheet:
     return _with_best(Sheet.of(columns, jobs), jobs)
 
 
-def safety(jobs: Sequence[Job]) -> Sheet:
+def safety(jobs: Sequence[Result]) -> Sheet:
     """Returns a row per job: the policy's measures of safety, and below them a baseline's."""
     columns = [_JOB]
     for metric, scope, baseline, form, heading in _SAFETY:
@@ -189,7 +189,7 @@ def safety(jobs: Sequence[Job]) -> Sheet:
     return Sheet.of(columns, jobs)
 
 
-def every_metric(jobs: Sequence[Job]) -> Sheet | None:
+def every_metric(jobs: Sequence[Result]) -> Sheet | None:
     """Returns a row per job with all metrics of the test part; None if no job lists its metrics."""
     known: dict[str, MetricInfo] = {}
     for job in jobs:
@@ -203,7 +203,7 @@ def every_metric(jobs: Sequence[Job]) -> Sheet | None:
     return Sheet.of(columns, jobs) if known else None
 
 
-def absolute(jobs: Sequence[Job]) -> dict[str, View]:
+def absolute(jobs: Sequence[Result]) -> dict[str, View]:
     """Errors of each method in m/s and m; a view for each error and part of the trajectories."""
     views = {}
     for metric, scope in _ERRORS:
@@ -223,32 +223,32 @@ def absolute(jobs: Sequence[Job]) -> dict[str, View]:
     return views
 
 
-def _shown_error(job: Job, metric: str, method: str, scope: str) -> float:
-    return job.metric(metric, method, scope) if method in job.meaningful_methods else math.nan
+def _shown_error(job: Result, metric: str, method: str, scope: str) -> float:
+    return job.metric(metric, method, scope) if method in job.shown_methods else math.nan
 
 
-def _error(job: Job, scope: str, method: str) -> Cell:
-    if not (method in job.meaningful_methods and job.has_metric("rmse_speed", method, scope)):
+def _error(job: Result, scope: str, method: str) -> Cell:
+    if not (method in job.shown_methods and job.has_metric("rmse_speed", method, scope)):
         return number(math.nan, "")
     gap = job.metric("rmse_gap", method, scope)
     second = formatted(gap, ".2f") if math.isfinite(gap) else ""
     return number(job.metric("rmse_speed", method, scope), ".3f", second)
 
 
-def _gain(job: Job, baseline: str, scope: str) -> Cell:
+def _gain(job: Result, baseline: str, scope: str) -> Cell:
     if baseline not in job.baselines(scope):
         return number(math.nan, "")
-    low = job.improvement("ci95_low", baseline, scope)
-    high = job.improvement("ci95_high", baseline, scope)
+    low = job.statistics(baseline, scope).ci95_low
+    high = job.statistics(baseline, scope).ci95_high
     second = ""
     if math.isfinite(low) and math.isfinite(high):
         digits = 0 if max(abs(low), abs(high)) >= 1 else 1
         ends = (percent(low, digits), percent(high, digits))
         second = " to ".join(end.removesuffix(" %") for end in ends)
-    return number(job.improvement("mean", baseline, scope), "+.1%", second)
+    return number(job.statistics(baseline, scope).mean, "+.1%", second)
 
 
-def _with_baseline(job: Job, metric: str, scope: str, baseline: str, form: str) -> Cell:
+def _with_baseline(job: Result, metric: str, scope: str, baseline: str, form: str) -> Cell:
     """Returns the policy's number, and below it the baseline's."""
     second = ""
     if baseline != job.judged and job.has_metric(metric, baseline, scope):
@@ -256,7 +256,7 @@ def _with_baseline(job: Job, metric: str, scope: str, baseline: str, form: str) 
     return number(job.metric(metric, job.judged, scope), form, second)
 
 
-def _with_best(sheet: Sheet, jobs: Sequence[Job]) -> Sheet:
+def _with_best(sheet: Sheet, jobs: Sequence[Result]) -> Sheet:
     """Marks the policy's smallest error and largest improvement, if all are tested on the same."""
     tests = set()
     for job in jobs:

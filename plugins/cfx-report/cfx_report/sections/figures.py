@@ -10,8 +10,8 @@ from typing import Any
 from cfx.plugin import (
     ALL_TYPES,
     OWN,
-    Job,
     Purpose,
+    Result,
     installed,
     name_of_indicator,
     percent,
@@ -53,7 +53,7 @@ class StyleSection(Section):
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return a job for each scoring of the drivers, with the names of those it holds for."""
-        jobs: dict[str, list[Job]] = {}
+        jobs: dict[str, list[Result]] = {}
         for job in runs.jobs:
             if len(job.tables.get("style", ())):
                 table = job.tables["style"][["driver", "score", "cluster"]].to_csv()
@@ -251,9 +251,9 @@ What lies outside a parameter's bounds is shaded.
         return {"jobs": jobs, "adapting": adapting, "constant": bool(constant), **shown}
 
 
-def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
+def chosen_pairs(job: Result) -> tuple[RankedPair, ...]:
     """Returns the best, the median and the worst pair; fewer if there are fewer."""
-    present = [trajectory.pair_id for trajectory in job.pair_trajectories]
+    present = [trajectory.pair_id for trajectory in job.trajectories]
     table = job.by_pair[job.by_pair["pair_id"].isin(present)]
     if job.purpose is Purpose.CALIBRATION:
         gains = -table[f"rmse_speed/{job.judged}"].to_numpy(dtype=float)
@@ -262,21 +262,21 @@ def chosen_pairs(job: Job) -> tuple[RankedPair, ...]:
     return rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
-def pair_of(job: Job, pair_id: str) -> dict[str, View]:
+def pair_of(job: Result, pair_id: str) -> dict[str, View]:
     """Speed, gap and each tuned parameter of one pair of a job."""
-    return {"": View(draw_pair(job.results, pair_id))}
+    return {"": View(draw_pair(job, pair_id))}
 
 
-def _title(job: Job, pair: RankedPair) -> str:
+def _title(job: Result, pair: RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
     if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
         title += f": {percent(pair.improvement, 1)} over {short_label('fixed')} calibration"
     return title
 
 
-def _errors_of_pair(job: Job, pair: RankedPair) -> str:
+def _errors_of_pair(job: Result, pair: RankedPair) -> str:
     row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
     errors = []
-    for method in job.meaningful_methods:
+    for method in job.shown_methods:
         errors.append(f"{short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
     return f"RMSE of speed (m/s): {', '.join(errors)}"

@@ -14,8 +14,8 @@ import pandas as pd
 from cfx.plugin import (
     CLUSTERS,
     Improvement,
-    Job,
     Purpose,
+    Result,
     explained,
     method_label,
     short_label,
@@ -31,7 +31,7 @@ from cfx_report.sections.results import STATISTICS
 _STATISTICS = ("mean", "ci95_low", "ci95_high")
 
 Pair = Mapping[str, Any]
-"""A row of `Job.by_pair`."""
+"""A row of `Result.by_pair`."""
 
 
 class DriversSection(Section):
@@ -58,7 +58,7 @@ by driver, style or errors.</p>
         return {"views": per_driver(jobs), "sheets": {job.name: pairs_of(job) for job in jobs}}
 
 
-def per_driver(jobs: Sequence[Job]) -> dict[str, View]:
+def per_driver(jobs: Sequence[Result]) -> dict[str, View]:
     """Improvement of every pair; a view per baseline."""
     tables = [_keyed(job, jobs) for job in jobs]
     views = {}
@@ -67,7 +67,7 @@ def per_driver(jobs: Sequence[Job]) -> dict[str, View]:
     return views
 
 
-def _keyed(job: Job, jobs: Sequence[Job]) -> pd.DataFrame:
+def _keyed(job: Result, jobs: Sequence[Result]) -> pd.DataFrame:
     """Returns the job's pairs with a key that is the same for the same pair of another job."""
     table = job.by_pair.copy()
     keys = table["pair_id"].astype(str)
@@ -77,7 +77,7 @@ def _keyed(job: Job, jobs: Sequence[Job]) -> pd.DataFrame:
     return table
 
 
-def _view(jobs: Sequence[Job], tables: Sequence[pd.DataFrame], baseline: str) -> View:
+def _view(jobs: Sequence[Result], tables: Sequence[pd.DataFrame], baseline: str) -> View:
     column = f"improvement/{baseline}"
     names, pair_ids, improvements, marks = [], [], [], []
     for job, table in zip(jobs, tables, strict=True):
@@ -85,7 +85,7 @@ def _view(jobs: Sequence[Job], tables: Sequence[pd.DataFrame], baseline: str) ->
             names.append(job.name)
             pair_ids.append(table["key"].tolist())
             improvements.append(table[column].to_numpy(dtype=float))
-            marks += [job.improvement(statistic, baseline) for statistic in _STATISTICS]
+            marks += [getattr(job.statistics(baseline), statistic) for statistic in _STATISTICS]
     bars = improvement_bars(names, pair_ids, improvements, baseline=baseline, marks=marks)
     # Best to worst of the first job; pairs that only others have follow.
     keys: dict[str, None] = {}
@@ -94,7 +94,7 @@ def _view(jobs: Sequence[Job], tables: Sequence[pd.DataFrame], baseline: str) ->
     return View(draw_every_pair(bars, list(keys)), bars.axis.note)
 
 
-def pairs_of(job: Job) -> Sheet:
+def pairs_of(job: Result) -> Sheet:
     """Returns a row per pair of a job: its driver, improvements and errors."""
     columns = [
         Column[Pair]("Pair", lambda row: str(row["pair_id"])),
@@ -123,7 +123,7 @@ def _errors_of_pair(method: str, row: Pair) -> Cell:
 
 
 Series = Mapping[str, Mapping[str, pd.DataFrame]]
-"""By name of some jobs and by cluster, some rows of `Job.by_pair`."""
+"""By name of some jobs and by cluster, some rows of `Result.by_pair`."""
 
 
 class ClustersSection(Section):
@@ -154,7 +154,7 @@ dashed one the mean; the dots are the pairs.</p>
         return {"views": per_cluster(series, baselines), "sheets": sheets}
 
 
-def cluster_series(jobs: Sequence[Job]) -> dict[str, dict[str, pd.DataFrame]]:
+def cluster_series(jobs: Sequence[Result]) -> dict[str, dict[str, pd.DataFrame]]:
     """Returns the pairs by series of jobs and cluster.
 
     A job that uses every driver is a series; jobs that differ in `style.cluster` alone are one
@@ -245,7 +245,7 @@ def statistics(table: pd.DataFrame, baseline: str) -> Improvement:
     """Returns the statistics over some pairs, as an evaluation makes them.
 
     Args:
-        table: some rows of `Job.by_pair`.
+        table: some rows of `Result.by_pair`.
         baseline: what the policy is compared with.
     """
     from cfx.plugin import improvement_statistics  # imports scipy

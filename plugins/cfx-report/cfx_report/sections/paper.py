@@ -14,7 +14,7 @@ from importlib import resources
 from operator import itemgetter
 from typing import Any
 
-from cfx.plugin import Job, percent_or_undefined, plural, without_folders
+from cfx.plugin import Result, percent_or_undefined, plural, without_folders
 from cfx_report.jobs import Runs
 from cfx_report.section import Cell, Column, Section, Sheet, number, text
 
@@ -41,7 +41,7 @@ class PaperSection(Section):
         paper = published()
         found = []
         for experiment, about in paper["experiments"].items():
-            jobs = [job for job in runs.jobs if job.experiment == experiment]
+            jobs = [job for job in runs.jobs if job.setting("preset") == experiment]
             if "ranked" in about:
                 jobs = _ranked(jobs, about["ranked"])
             if jobs:
@@ -63,7 +63,7 @@ def published() -> dict[str, Any]:
     return found
 
 
-def comparison(about: Mapping[str, Any], jobs: Sequence[Job]) -> Sheet:
+def comparison(about: Mapping[str, Any], jobs: Sequence[Result]) -> Sheet:
     """Return the paper's rows of an experiment, and a row per job; names stand first."""
     rows = [("paper", *row) for row in about["published"]]
     for job in jobs:
@@ -76,7 +76,7 @@ def comparison(about: Mapping[str, Any], jobs: Sequence[Job]) -> Sheet:
     return Sheet.of(columns, rows)
 
 
-def value_of(job: Job, path: str) -> Any:
+def value_of(job: Result, path: str) -> Any:
     """Return what a column shows of a job: a text or a number, NaN where it is not known.
 
     Args:
@@ -97,7 +97,7 @@ def value_of(job: Job, path: str) -> Any:
     return readers[kind](*rest)
 
 
-def _pair(job: Job) -> str:
+def _pair(job: Result) -> str:
     """Return the numbers of a single pair, or how many there are."""
     table = job.pairs.drop_duplicates("pair_id")
     if len(table) > 1 or not {"follower_id", "leader_id"} <= set(table.columns):
@@ -105,7 +105,7 @@ def _pair(job: Job) -> str:
     return f"{table['follower_id'].iloc[0]}/{table['leader_id'].iloc[0]}"
 
 
-def verdicts(about: Mapping[str, Any], jobs: Sequence[Job]) -> list[str]:
+def verdicts(about: Mapping[str, Any], jobs: Sequence[Result]) -> list[str]:
     """Return what the jobs say of the paper's claim, and the claim."""
     said = []
     if about["judged"]:
@@ -123,17 +123,17 @@ def verdicts(about: Mapping[str, Any], jobs: Sequence[Job]) -> list[str]:
     return [*said, about["claim"]]
 
 
-def _ranked(jobs: Sequence[Job], path: str) -> list[Job]:
+def _ranked(jobs: Sequence[Result], path: str) -> list[Result]:
     """Return the jobs by a number, the smallest first, those where it is not known last."""
 
-    def place(job: Job) -> tuple[bool, float]:
+    def place(job: Result) -> tuple[bool, float]:
         value = value_of(job, path)
         return not math.isfinite(value), value
 
     return sorted(jobs, key=place)
 
 
-def _compared(better: Mapping[str, str], judged: str, jobs: Sequence[Job]) -> list[str]:
+def _compared(better: Mapping[str, str], judged: str, jobs: Sequence[Result]) -> list[str]:
     """Say whether the policy fares better with one value than with another, others being equal."""
     gains: dict[str, dict[str, float]] = {}
     for job in jobs:
@@ -152,7 +152,7 @@ def _compared(better: Mapping[str, str], judged: str, jobs: Sequence[Job]) -> li
     return said
 
 
-def differences(paper: Mapping[str, Any], about: Mapping[str, Any], jobs: Sequence[Job]) -> str:
+def differences(paper: Mapping[str, Any], about: Mapping[str, Any], jobs: Sequence[Result]) -> str:
     """Say what of the jobs' set-up is not the paper's; only what can be read off the jobs."""
     pairs = about["pairs"]
     listed = list(paper["differences"])

@@ -15,9 +15,9 @@ from cfx.plugin import (
     SCOPES,
     TEST,
     Improvement,
-    Job,
     MetricInfo,
     Purpose,
+    Result,
     explained,
     method_label,
     short_label,
@@ -67,7 +67,7 @@ interval contains 0, the job does not tell whether the policy helps.</p>
         }
 
 
-def overview(jobs: Sequence[Job]) -> dict[str, View]:
+def overview(jobs: Sequence[Result]) -> dict[str, View]:
     """Mean improvement with its 95 % interval; a view per baseline and part of the trajectories."""
     views = {}
     for scope in SCOPES:
@@ -84,7 +84,7 @@ def overview(jobs: Sequence[Job]) -> dict[str, View]:
 
 
 class _Tested(NamedTuple):
-    job: Job
+    job: Result
     method: str
 
     @property
@@ -92,13 +92,13 @@ class _Tested(NamedTuple):
         return int((self.job.pairs["method"] == self.method).sum())
 
 
-def errors(jobs: Sequence[Job]) -> Sheet:
+def errors(jobs: Sequence[Result]) -> Sheet:
     """Returns the errors: a row per job and method. The numbers are those of `metrics.json`."""
     rows: list[_Tested] = []
     methods: list[str] = []
     for job in jobs:
         methods += job.methods
-        rows += [_Tested(job, method) for method in job.meaningful_methods]
+        rows += [_Tested(job, method) for method in job.shown_methods]
     columns = [
         Column[_Tested]("Job", lambda row: row.job.name),
         Column("Method", lambda row: method_cell(row.method), methods_explained(methods)),
@@ -190,7 +190,7 @@ class _Compared(NamedTuple):
     found: Improvement
 
 
-def improvements(jobs: Sequence[Job]) -> Sheet:
+def improvements(jobs: Sequence[Result]) -> Sheet:
     """Returns the policy's improvement: a row per job, baseline and part of the trajectories."""
     full = bool(any_baselines(jobs, FULL_TRAJECTORY))
     scopes = (TEST, FULL_TRAJECTORY) if full else (TEST,)
@@ -316,7 +316,7 @@ of acceleration, where the guard steps in.
 
 
 class _Driven(NamedTuple):
-    job: Job
+    job: Result
     method: str
 
 
@@ -338,7 +338,7 @@ _SAFETY = (
 """Heading, metric and format."""
 
 
-def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
+def safety_of_methods(jobs: Sequence[Result]) -> Sheet:
     """Returns a row per job and method, with the recorded drivers for comparison."""
     columns = [
         Column[_Driven]("Job", lambda row: row.job.name),
@@ -357,7 +357,7 @@ def safety_of_methods(jobs: Sequence[Job]) -> Sheet:
         columns.append(Column(heading, cell, group=group))
     rows = []
     for job in jobs:
-        for method in ("real", *job.meaningful_methods):
+        for method in ("real", *job.shown_methods):
             if any(math.isfinite(job.metric(metric, method)) for _, metric, _ in _SAFETY):
                 rows.append(_Driven(job, method))
     return Sheet.of(columns, rows)
@@ -399,9 +399,9 @@ class _Measured(NamedTuple):
     scope: str
 
 
-def all_metrics(job: Job) -> Sheet:
+def all_metrics(job: Result) -> Sheet:
     """Returns a row for each metric and part of the trajectories, a column for each method."""
-    methods = list(job.meaningful_methods)
+    methods = list(job.shown_methods)
     if any(key.endswith("/real") for key in job.metrics):
         methods.insert(0, "real")
     columns = [
@@ -427,7 +427,7 @@ def _meaning(row: _Measured) -> str:
     return said
 
 
-def _value(job: Job, method: str, row: _Measured) -> Cell:
+def _value(job: Result, method: str, row: _Measured) -> Cell:
     value = job.metric(row.metric.name, method, row.scope)
     whole = math.isfinite(value) and value == round(value) and abs(value) < 1e6
     return number(value, ".0f" if whole else ".3g")

@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from cfx.plugin import NOTHING, Job, Purpose, without_folders
+from cfx.plugin import NOTHING, Purpose, Result, without_folders
 from cfx_report.jobs import Runs, are_calibrations
 from cfx_report.section import Column, Section, Sheet
 
@@ -70,7 +70,7 @@ class ConfigurationsSection(Section):
         return {"configurations": found}
 
 
-def _configuration(job: Job) -> str:
+def _configuration(job: Result) -> str:
     """Returns the configuration as YAML, after what the protocol noted of its design."""
     design = ""
     notes = job.data.get("protocol")
@@ -81,7 +81,7 @@ def _configuration(job: Job) -> str:
     return design + without_folders(str(text))
 
 
-def facts(jobs: Sequence[Job]) -> tuple[list[tuple[str, str]], Sheet | None]:
+def facts(jobs: Sequence[Result]) -> tuple[list[tuple[str, str]], Sheet | None]:
     """Returns what all jobs share, and a table of what they do not (None if they share all)."""
     rows = []
     names: dict[str, None] = {}
@@ -115,15 +115,15 @@ def duration(seconds: float | None) -> str:
     return f"{rest} s"
 
 
-def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
+def _facts(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
     table = job.pairs.drop_duplicates("pair_id")
     found = {
         "Started": f"{job.started:%Y-%m-%d %H:%M}" if job.started else "not recorded",
         "Took": duration(job.seconds),
         **_typed(job, jobs),
     }
-    if job.experiment:
-        found["Preset"] = job.experiment
+    if job.setting("preset"):
+        found["Preset"] = job.setting("preset")
     return found | {
         "Data": without_folders(str(job.data.get("source") or job.component("data") or NOTHING)),
         "Pairs": f"{len(table)} pairs of {table['driver'].nunique()} drivers",
@@ -140,7 +140,7 @@ def _facts(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
     }
 
 
-def _calibration(job: Job) -> str:
+def _calibration(job: Result) -> str:
     said = job.component("optimizer") or NOTHING
     objective = job.data.get("objective")
     if isinstance(objective, Mapping):
@@ -148,7 +148,7 @@ def _calibration(job: Job) -> str:
     return said
 
 
-def _left_out(job: Job) -> str:
+def _left_out(job: Result) -> str:
     parts = []
     for one in job.data.get("dropped") or ():
         if isinstance(one, Mapping):
@@ -156,7 +156,7 @@ def _left_out(job: Job) -> str:
     return "; ".join(parts) or "nothing"
 
 
-def _typed(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
+def _typed(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
     """Returns what was typed: of several jobs, what they share and what each has of its own."""
     if job.overrides is None:
         return {"Command": "not recorded"}
@@ -178,7 +178,7 @@ def _command(overrides: Sequence[str]) -> str:
     return without_folders(shlex.join(["python", "-m", "cfx", *overrides]))
 
 
-def _shared_overrides(jobs: Sequence[Job]) -> list[str]:
+def _shared_overrides(jobs: Sequence[Result]) -> list[str]:
     """Returns the overrides that all jobs with known overrides have, in order."""
     known = [job.overrides for job in jobs if job.overrides is not None]
     shared = []
@@ -193,14 +193,14 @@ def _range(values: pd.Series[Any]) -> str:
     return str(low) if low == high else f"{low} to {high}"
 
 
-def _policy(job: Job, jobs: Sequence[Job]) -> dict[str, str]:
+def _policy(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
     """Returns which policy a job has; nothing where all jobs are calibrations."""
     if are_calibrations(jobs):
         return {}
     return {"Policy": f"{job.component('policy')}, {_learned(job)}"}
 
 
-def _learned(job: Job) -> str:
+def _learned(job: Result) -> str:
     """Says how the policy was learned."""
     learner = job.component("learner")
     if job.purpose is Purpose.CALIBRATION:
@@ -210,7 +210,7 @@ def _learned(job: Job) -> str:
     return f"as it was learned in {job.setting('protocol.run')}"
 
 
-def _protocol(job: Job) -> str:
+def _protocol(job: Result) -> str:
     name = job.component("protocol")
     train, test = f"{100 * job.split:.3g} %", f"{100 * (1 - job.split):.3g} %"
     parts = (

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from cfx.data.style import StyleResult
 from cfx.evaluation.tables import scope_label
-from cfx.figures.figure import ParameterAxis
 from cfx.figures.text import common_prefix, shortened
+from cfx.results.result import ParameterAxis
 from cfx_report.figures.calibration import correlations, parameter_spreads, spread_offsets
 from cfx_report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
 from cfx_report.figures.jobs import error_limit

@@ -15,9 +15,10 @@ from matplotlib.image import imread
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation, Purpose
-from cfx.figures.figure import Results, draw_figure, figure_named, write_figure, write_figures
+from cfx.figures.drawing import draw_figure, figure_named, write_figure, write_figures
 from cfx.figures.text import COLOURS, percent, pretty_unit, shortened, unit_label
 from cfx.learners.curves import over_networks
+from cfx.results.result import Result
 from cfx_report.figures.improvements import amounts_of
 from cfx_report.figures.learning import SAMPLED
 from cfx_report.figures.platoon import braking_time, worst_platoon
@@ -30,17 +31,17 @@ TEN = ParameterSpace.of(
 )
 
 
-def all_of(made: MadeUp) -> Results:
-    return Results.of(made.evaluation, style=made.style, tables={"curves": made.curves})
+def all_of(made: MadeUp) -> Result:
+    return Result.of(made.evaluation, tables={"curves": made.curves})
 
 
-def drawn(name: str, results: Results) -> Figure:
+def drawn(name: str, results: Result) -> Figure:
     found = draw_figure(figure_named(name), results)
     assert found is not None
     return found
 
 
-def learned(curves: pd.DataFrame) -> Results:
+def learned(curves: pd.DataFrame) -> Result:
     return dataclasses.replace(all_of(make_results(pairs=1, frames=5)), tables={"curves": curves})
 
 
@@ -97,11 +98,11 @@ def test_chosen_parameters_have_an_axis_each(count: int) -> None:
 def test_undefined_improvements_are_counted_and_not_drawn() -> None:
     results = make_results(pairs=5, frames=20)
     some = drawn(
-        "improvement_per_driver", Results.of(with_improvement(results, {1: np.nan, 2: -np.inf}))
+        "improvement_per_driver", Result.of(with_improvement(results, {1: np.nan, 2: -np.inf}))
     )
     assert "3 pairs" in texts(some)
     assert "2 without a defined improvement" in texts(some)
-    none = Results.of(with_improvement(results, dict.fromkeys(range(5), np.nan)))
+    none = Result.of(with_improvement(results, dict.fromkeys(range(5), np.nan)))
     for found, words in (
         (drawn("improvement_per_driver", none), "no pair has a defined improvement"),
         (drawn("drives", none), "improvement undefined"),
@@ -115,7 +116,7 @@ def test_an_outlier_is_labelled_and_does_not_shrink_the_others() -> None:
     results = make_results(pairs=20, frames=20)
     tame = with_improvement(results, {k: 0.3 - 0.02 * k for k in range(20)})
     wild = with_improvement(dataclasses.replace(results, evaluation=tame), {19: -7.0})
-    found = drawn("improvement_per_driver", Results.of(wild))
+    found = drawn("improvement_per_driver", Result.of(wild))
     assert "\N{MINUS SIGN}700 %" in texts(found)
     assert found.axes[0].get_ylim()[0] > -2.0
 
@@ -124,10 +125,10 @@ def test_drives_shows_best_median_and_worst() -> None:
     results = make_results(pairs=7, frames=20)
     evaluation = with_improvement(results, {k: 0.1 * k for k in range(7)})
     ids = [drive.pair_id for drive in evaluation.trajectories]
-    written = texts(drawn("drives", Results.of(evaluation)))
+    written = texts(drawn("drives", Result.of(evaluation)))
     for rank, k in (("best", 6), ("median", 3), ("worst", 0)):
         assert f"{rank} pair, {ids[k]}:  {percent(0.1 * k)}" in written
-    one = drives(Results.of(evaluation), pair_id=ids[2])
+    one = drives(Result.of(evaluation), pair_id=ids[2])
     assert len(one.axes) == 2
     rows = evaluation.table[
         (evaluation.table["pair_id"] == ids[2]) & (evaluation.table["method"] == "fixed")
@@ -142,7 +143,7 @@ def test_an_unknown_pair_is_named_with_the_nearest() -> None:
     with pytest.raises(
         ConfigError, match=r"pair 'i80-0400-1000-99' is not .* Did you mean 'i80-0400-1000-990'"
     ):
-        drives(Results.of(evaluation), pair_id="i80-0400-1000-99")
+        drives(Result.of(evaluation), pair_id="i80-0400-1000-99")
 
 
 def test_a_default_driver_far_away_does_not_shrink_the_others() -> None:
@@ -151,7 +152,7 @@ def test_a_default_driver_far_away_does_not_shrink_the_others() -> None:
     far = dataclasses.replace(
         drive, gap={**drive.gap, "default": drive.real_gap + np.linspace(0, 500, 51)}
     )
-    found = drives(Results.of(dataclasses.replace(evaluation, trajectories=(far,))))
+    found = drives(Result.of(dataclasses.replace(evaluation, trajectories=(far,))))
     assert found.axes[1].get_ylim()[1] < 120
     assert "default up to" in texts(found)
 
@@ -168,7 +169,7 @@ def test_a_collision_is_marked_and_a_diverged_drive_is_survived() -> None:
         },
         speed={**drive.speed, "fixed": np.full(51, np.nan)},
     )
-    found = drives(Results.of(dataclasses.replace(evaluation, trajectories=(bad,))))
+    found = drives(Result.of(dataclasses.replace(evaluation, trajectories=(bad,))))
     found.canvas.draw()
     assert "policy collides" in texts(found)
 
@@ -182,7 +183,7 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
         values=results.evaluation.values.assign(pair_id=name),
         trajectories=(dataclasses.replace(results.evaluation.trajectories[0], pair_id=name),),
     )
-    odd = Results.of(evaluation, style=results.style, tables={"curves": results.curves})
+    odd = Result.of(evaluation, tables={"curves": results.curves})
     assert len(write_figures(tmp_path, odd)) == 10
 
 
@@ -196,7 +197,7 @@ def test_cuts_and_cluster_sizes_stand_in_the_style_figure() -> None:
         assert f"{name}: {count}" in written
     lost = dataclasses.replace(style, table=style.table.assign(score=np.nan))
     assert "94 drivers without a score" in texts(
-        drawn("style_distribution", Results.of(made.evaluation, style=lost))
+        drawn("style_distribution", Result.of(dataclasses.replace(made.evaluation, style=lost)))
     )
 
 
@@ -256,7 +257,7 @@ def test_each_method_has_its_own_speed_plot() -> None:
     evaluation = make_results(
         pairs=3, methods=("default", "population", "fixed", "policy")
     ).evaluation
-    found = drawn("speeds", Results.of(evaluation))
+    found = drawn("speeds", Result.of(evaluation))
     assert len(found.axes) == 4
     row = evaluation.table[evaluation.table["method"] == "population"].sort_values("improvement")
     assert any(f"{value:.3f} m/s" in texts(found) for value in row["rmse_speed"])
@@ -264,7 +265,7 @@ def test_each_method_has_its_own_speed_plot() -> None:
 
 def test_a_panel_per_method_shows_the_worst_platoon() -> None:
     platoon = make_platoon({"default": 1, "policy": 3})
-    results = Results.of(
+    results = Result.of(
         make_results(pairs=1, frames=5).evaluation,
         tables={"platoon": platoon.table},
         metrics=platoon.metrics(),
@@ -311,7 +312,7 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(
     history = make_history(results.evaluation.trajectories, GAINS)
     platoon = make_platoon({"policy": 2})
     tables = {"curves": results.curves, "platoon": platoon.table, "history": history}
-    every = Results.of(results.evaluation, style=results.style, tables=tables)
+    every = Result.of(results.evaluation, tables=tables)
     names = {path.name for path in write_figures(tmp_path, every)}
     assert {"platoon.png", "history.png"} <= names
     assert len(names) == 13

@@ -14,7 +14,9 @@ from matplotlib import pyplot as plt
 from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.figures.canvas import canvas, hover
-from cfx.figures.figure import JobFigure, Results, draw_figure, write_figure, write_figures
+from cfx.figures.drawing import draw_figure, write_figure, write_figures
+from cfx.results.figure import JobFigure
+from cfx.results.result import Result
 from cfx_report.inline import PLACE, inline_svg
 from cfx_report.page import render
 from cfx_report.runs import read_runs
@@ -30,7 +32,7 @@ from tests.made_up import (
 )
 
 
-def _known(results: Results) -> dict[str, float]:
+def _known(results: Result) -> dict[str, float]:
     known = {"pareto_k": 0.3, "effective_samples": 400.0}
     for axis in results.parameters:
         known |= {f"low_{axis.name}": 1.0, f"median_{axis.name}": 2.0, f"high_{axis.name}": 3.0}
@@ -38,7 +40,7 @@ def _known(results: Results) -> dict[str, float]:
     return known
 
 
-def _drawn(results: Results) -> dict[str, float]:
+def _drawn(results: Result) -> dict[str, float]:
     return {f"parameter_{axis.name}": 2.0 for axis in results.parameters}
 
 
@@ -46,7 +48,7 @@ FAN = {"low": 0.5, "median": 1.0, "high": 1.5}
 
 
 @pytest.fixture(scope="module")
-def everything() -> Results:
+def everything() -> Result:
     """Results of a job that measured all that figures can show."""
     made = make_results(pairs=5, frames=60)
     forecasts = make_forecasts()
@@ -54,7 +56,8 @@ def everything() -> Results:
     at_sites = made.style.table.assign(driver_type="", site="")
     at_sites["site"] = [("A", "B")[number % 2] for number in range(len(at_sites))]
     style = dataclasses.replace(made.style, table=at_sites)
-    results = Results.of(evaluation, style=style, tables={"curves": made.curves})
+    evaluation = dataclasses.replace(evaluation, style=style)
+    results = Result.of(evaluation, tables={"curves": made.curves})
     ids, axis = evaluation.table["pair_id"].unique(), results.parameters[0]
     slices = pd.DataFrame(
         [(ids[0], axis.name, place, place, 1 + place, 1.0) for place in (0.0, 0.5, 1.0)],
@@ -93,7 +96,7 @@ OWN = [
 
 @pytest.mark.parametrize("one", OWN, ids=lambda one: one.name)
 def test_every_figure_keeps_its_contract(
-    one: registry.Installed[JobFigure], everything: Results
+    one: registry.Installed[JobFigure], everything: Result
 ) -> None:
     settings = dict(mpl.rcParams)
     drawn = draw_figure(one, everything)
@@ -115,7 +118,7 @@ def test_every_figure_keeps_its_contract(
     assert dict(mpl.rcParams) == settings
 
 
-def test_the_same_figure_gives_the_same_bytes(everything: Results, tmp_path: Path) -> None:
+def test_the_same_figure_gives_the_same_bytes(everything: Result, tmp_path: Path) -> None:
     one = next(one for one in OWN if one.name == "style_distribution")
     for form in ("png", "pdf", "svg"):
         written = []
@@ -129,7 +132,7 @@ def test_the_same_figure_gives_the_same_bytes(everything: Results, tmp_path: Pat
 @pytest.mark.parametrize("one", registry.installed("figure"), ids=lambda one: one.name)
 def test_a_figure_of_what_was_not_measured_is_left_out(one: registry.Installed[JobFigure]) -> None:
     table = make_results(pairs=1, frames=5).evaluation.table
-    bare = Results(table[table["method"] == "default"], ("default",), ())
+    bare = Result(tables={"pairs": table[table["method"] == "default"]})
     assert draw_figure(one, bare) is None
 
 
@@ -151,7 +154,7 @@ def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_sh
 
 FURTHER = """
     from cfx.figures.canvas import canvas
-    from cfx.figures.figure import JobFigure
+    from cfx.results.figure import JobFigure
 
     class Further(JobFigure):
         \"\"\"A figure of a third party.\"\"\"
@@ -184,7 +187,7 @@ def test_a_third_partys_figure_needs_a_class_and_an_entry_point(
     write_job(tmp_path / "job", pairs=3)
     names = [one.name for one in registry.installed("figure")]
     made = make_results(pairs=1, frames=5)
-    paths = write_figures(tmp_path / "figures", Results.of(made.evaluation))
+    paths = write_figures(tmp_path / "figures", Result.of(made.evaluation))
     page = render(read_runs([str(tmp_path / "job")]))
     assert names[:2] == ["broken", "further"]
     assert {"missing", "untitled"}.isdisjoint(names)

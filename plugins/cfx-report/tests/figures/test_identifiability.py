@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from cfx.figures.figure import ParameterAxis
+from cfx.results.result import ParameterAxis
 from cfx_report.figures.calibration import (
     draw_fits,
     draw_labels,

@@ -14,7 +14,8 @@ from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.errors import ConfigError
 from cfx.figures.canvas import Paper, canvas, on_paper, points, side_by_side, wrapped
-from cfx.figures.figure import Results, draw_figure, figure_named
+from cfx.figures.drawing import draw_figure, figure_named
+from cfx.results.result import Result
 from tests.job_folders import write_job
 from tests.made_up import make_results
 
@@ -22,12 +23,12 @@ COLUMN = Paper(width=88 / 25.4, font_size=8.0)
 
 
 @pytest.fixture(scope="module")
-def results() -> Results:
+def results() -> Result:
     made = make_results(pairs=5, frames=60)
-    return Results.of(made.evaluation, style=made.style, tables={"curves": made.curves})
+    return Result.of(made.evaluation, tables={"curves": made.curves})
 
 
-def test_no_text_of_any_figure_is_larger_than_the_paper_asks_for(results: Results) -> None:
+def test_no_text_of_any_figure_is_larger_than_the_paper_asks_for(results: Result) -> None:
     drawn = 0
     for one in registry.installed("figure"):
         if one.distribution not in {OWN, "cfx-report", "cfx-forecasts"}:
@@ -59,7 +60,7 @@ def test_panels_stand_below_each_other_where_text_has_no_room() -> None:
     assert wrapped("word " * 40) == "word " * 40
 
 
-def test_the_usual_paper_is_as_it_was(results: Results) -> None:
+def test_the_usual_paper_is_as_it_was(results: Result) -> None:
     figure = draw_figure(figure_named("error_over_time"), results)
     assert figure is not None
     assert tuple(figure.get_size_inches()) == (10.5, 3.9)

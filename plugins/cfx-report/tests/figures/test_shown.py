@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from cfx.evaluation.result import Evaluation
-from cfx.figures.figure import Results, parameter_axes
 from cfx.figures.text import colour_of
 from cfx.learners.curves import over_networks
+from cfx.results.result import Result
 from cfx_report.figures.calibration import correlations, draw_calibration, parameter_spreads
 from cfx_report.figures.improvements import draw_improvements, improvement_bars
 from cfx_report.figures.jobs import draw_every_pair
@@ -43,7 +43,7 @@ def make_panels(far: float = 0.0) -> tuple[Evaluation, PairPanels]:
     gap["default"] = gap["default"] + np.linspace(0, far, 31)
     gap["policy"] = trajectory.real_gap - np.linspace(0, 40, 31)
     trajectory = dataclasses.replace(trajectory, gap=gap)
-    axes = parameter_axes(evaluation.parameters)
+    axes = Result.of(evaluation).parameters
     return evaluation, pair_panels(trajectory, evaluation.methods, axes)
 
 
@@ -72,10 +72,10 @@ def test_parameters_have_their_limits_and_say_what_they_mean() -> None:
         for one, meaning in zip(evaluation.parameters, meanings, strict=True)
     ]
     evaluation = dataclasses.replace(evaluation, parameters=tuple(parameters))
-    axes = parameter_axes(evaluation.parameters)
+    axes = Result.of(evaluation).parameters
     panels = pair_panels(evaluation.trajectories[0], evaluation.methods, axes)
     alone = draw_parameters(panels, evaluation.methods).axes[1:]
-    of_pair = draw_pair(Results.of(evaluation), panels.pair_id).axes[2:]
+    of_pair = draw_pair(Result.of(evaluation), panels.pair_id).axes[2:]
     for drawn in (alone, of_pair):
         for panel, one in zip(panels.parameters, drawn, strict=True):
             assert list(one.get_ylim()) == pytest.approx([panel.low, panel.high])
@@ -85,7 +85,7 @@ def test_parameters_have_their_limits_and_say_what_they_mean() -> None:
 def test_a_hidden_method_is_left_out() -> None:
     methods = ("default", "fixed", "shrunk", "policy")
     evaluation = make_results(pairs=1, frames=30, methods=methods).evaluation
-    panels = pair_panels(evaluation.trajectories[0], methods, parameter_axes(evaluation.parameters))
+    panels = pair_panels(evaluation.trajectories[0], methods, Result.of(evaluation).parameters)
     figure = draw_pairs([("", "", "")], [panels], methods)
     assert colour_of("shrunk") not in drawn_lines(figure.axes[0])
 
@@ -153,7 +153,7 @@ def test_the_report_of_a_job_shows_the_pairs_of_its_figures(tmp_path: Path) -> N
     gains = rows["improvement"].to_numpy(dtype=float)
     ranked = rank_pairs(rows["pair_id"].tolist(), gains)
     assert [one.pair_id for one in chosen_pairs(job)] == [one.pair_id for one in ranked]
-    for results in (Results.of(evaluation), job.results):
+    for results in (Result.of(evaluation), job):
         figure = drives(results)
         titles = "\n".join(text.get_text() for axes in figure.axes for text in axes.texts)
         for one in ranked:
@@ -164,8 +164,8 @@ def test_calibrated_parameters_have_their_places_and_correlations() -> None:
     evaluation = make_results(
         pairs=9, frames=20, methods=("default", "population", "fixed")
     ).evaluation
-    spreads = parameter_spreads(evaluation.table, parameter_axes(evaluation.parameters))
-    table = correlations(evaluation.table, parameter_axes(evaluation.parameters))
+    spreads = parameter_spreads(evaluation.table, Result.of(evaluation).parameters)
+    table = correlations(evaluation.table, Result.of(evaluation).parameters)
     drawn, image = draw_calibration(spreads, table).axes[:2]
     places = []
     for line in drawn.lines:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.plugin import COLOURS, Agent, Evaluation, Results, atomic_write, method_label
+from cfx.plugin import COLOURS, Agent, Evaluation, Result, atomic_write, method_label
 from cfx_report.inline import embedded_json, inline_scripts, security_policy
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
@@ -152,10 +152,10 @@ def _plots(evaluation: Evaluation) -> list[_Plot]:
     from cfx_report.figures.trajectories import draw_pair
     from cfx_report.inline import PLACE, inline_svg
 
-    results = Results.of(evaluation)
+    result = Result.of(evaluation)
     found = []
     for k, trajectory in enumerate(evaluation.trajectories):
-        figure = draw_pair(results, trajectory.pair_id)
+        figure = draw_pair(result, trajectory.pair_id)
         svg = inline_svg(figure).replace(PLACE, f"plot-{k}-")
         axes = []
         for one in figure.axes:

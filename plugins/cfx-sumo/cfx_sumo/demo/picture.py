@@ -15,7 +15,7 @@ from cfx.plugin import (
     COLOURS,
     INK,
     Evaluation,
-    Results,
+    Result,
     canvas,
     method_label,
     shortened,
@@ -50,7 +50,7 @@ def write_pictures(
     middle = simulated[len(simulated) // 2]
     together = [one for one in simulated if one.scene == middle.scene]
     picture = write_figure(snapshots(road, middle, together), folder / "demo.png")
-    trajectories = drives(Results.of(evaluation), [one.pair.pair_id for one in simulated])
+    trajectories = drives(Result.of(evaluation), [one.pair.pair_id for one in simulated])
     return [picture, write_figure(trajectories, folder / "demo_drives.png")]
 
 
