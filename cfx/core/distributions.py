@@ -19,6 +19,13 @@ from typing import Any
 
 from cfx.errors import nearest
 
+__all__ = [
+    "OWN",
+    "install_line",
+]
+"""What plugins may use, as `cfx.plugin.distributions`."""
+
+
 OWN = "cfx-driving"
 """cfx's own distribution: no other can replace its components."""
 

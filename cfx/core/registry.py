@@ -41,6 +41,15 @@ from cfx.core.distributions import OWN, advice
 from cfx.core.guest import same_environment
 from cfx.errors import CfxError, ConfigError, PluginError, Terminated, in_words, nearest
 
+__all__ = [
+    "KINDS",
+    "create",
+    "entries",
+    "installed",
+]
+"""What plugins may use, as `cfx.plugin.registry`."""
+
+
 log = logging.getLogger(__name__)
 
 T = TypeVar("T")

@@ -20,6 +20,13 @@ from cfx.core.distributions import install_line
 from cfx.core.files import atomic_write
 from cfx.errors import CfxError, DataError, NotInstalledError, first_line, without_passwords
 
+__all__ = [
+    "is_url",
+    "local_folder",
+]
+"""What plugins may use, as `cfx.plugin.storage`."""
+
+
 _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}
 """Packages that fsspec needs for kinds of URLs."""
 

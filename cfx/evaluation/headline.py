@@ -8,6 +8,14 @@ from typing import NamedTuple
 
 from cfx.evaluation.metrics.base import key_of
 
+__all__ = [
+    "Comparison",
+    "contradiction",
+    "opposite",
+]
+"""What plugins may use, as `cfx.plugin.headline`."""
+
+
 RESULT = "result"
 """The tag that says it in words."""
 

@@ -18,6 +18,16 @@ from cfx.evaluation.headline import lower_by, opposite
 if TYPE_CHECKING:
     import pandas as pd
 
+__all__ = [
+    "Against",
+    "against_the_best",
+    "improvement_statistics",
+    "mean_interval",
+    "verdict",
+]
+"""What plugins may use, as `cfx.plugin.statistics`."""
+
+
 _TRIMMED = 0.1
 """Share dropped at each end of the improvements for the trimmed mean, as in the paper."""
 

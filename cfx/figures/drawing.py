@@ -22,6 +22,16 @@ from cfx.errors import DataError, OutputError, listed, nearest
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+__all__ = [
+    "FIGURE_METADATA",
+    "draw_figure",
+    "figure_named",
+    "write_figure",
+    "write_figures",
+]
+"""What plugins may use, as `cfx.plugin.drawing`."""
+
+
 log = logging.getLogger(__name__)
 
 

@@ -24,6 +24,14 @@ from torch import Tensor
 from cfx.data.pairs import PairBatch
 from cfx.policies.features import History
 
+__all__ = [
+    "FADED",
+    "RANGE_SIGNALS",
+    "share_in_words",
+]
+"""What plugins may use, as `cfx.plugin.valid_range`."""
+
+
 FADED = 2.5
 """Score from which on nothing is left of an agent's answer. Nearer bounds are worse: mixtures of an
 answer and the base can be worse than either, and just outside the answers are still good."""

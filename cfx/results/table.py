@@ -9,7 +9,6 @@ reports and figures (`Result.tables`) read them back.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -32,7 +31,6 @@ from cfx.errors import DataError, PluginError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-    from rich.table import Table
 
     from cfx.evaluation.result import Evaluation
 
@@ -298,31 +296,6 @@ def _metrics_of(
 def _together(table: registry.Installed[ResultTable], evaluation: Evaluation) -> pd.DataFrame:
     """Returns all rows of a large table."""
     return pd.concat(list(parts_of(table, evaluation) or ()))
-
-
-def metrics_table(
-    title: str,
-    methods: Iterable[str],
-    columns: Mapping[str, tuple[str, str]],
-    metrics: Mapping[str, float],
-) -> Table:
-    """Returns a table for the console with a row per method; what is not known is an empty cell.
-
-    `columns`: by heading what a metric is called before `/METHOD`, and how it is formatted.
-    """
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left")
-    table.add_column("method")
-    for heading in columns:
-        table.add_column(heading, justify="right")
-    for method in methods:
-        cells = []
-        for name, form in columns.values():
-            value = metrics.get(f"{name}/{method}", math.nan)
-            cells.append(f"{value:{form}}" if math.isfinite(value) else "")
-        table.add_row(method, *cells)
-    return table
 
 
 def stored_tables(folder: Path) -> Tables:

@@ -9,7 +9,7 @@ import json
 from pathlib import Path
 
 from cfx.errors import DataError
-from cfx.plugin import ExportFormat, examine, folder_of, stored_tables, write_output
+from cfx.plugin import ExportFormat, files, folder_of, job_folder, stored_tables
 
 FILE = "driver_json.json"
 PREFIX = "parameter_"
@@ -20,7 +20,7 @@ class DriverJson(ExportFormat):
 
     def write(self, run: str, output: Path | None) -> list[str]:
         folder = folder_of(run)
-        examine(folder)  # the folder may be another person's
+        job_folder.examine(folder)  # the folder may be another person's
         pairs = stored_tables(folder).get("pairs")
         if pairs is None:
             raise DataError(f"{folder} holds no pairs.csv; give the output folder of a job")
@@ -35,5 +35,5 @@ class DriverJson(ExportFormat):
         # A job that is no folder here, such as one of a URL, has its file where the user is.
         home = folder if Path(run).expanduser().is_dir() else Path()
         path = output or home / FILE
-        write_output(path, json.dumps(drivers, indent=1), "the list of parameters")
+        files.write_output(path, json.dumps(drivers, indent=1), "the list of parameters")
         return [f"parameters of {len(drivers)} drivers: {path}"]

@@ -22,7 +22,7 @@ class PolicyErrors(JobFigure):
         if not {"policy", "fixed"} <= set(result.shown_methods):
             return None
         errors = result.pairs.pivot(index="pair_id", columns="method", values="rmse_speed")
-        figure = canvas(3.9)
+        figure = canvas.blank(3.9)
         axes = figure.subplots()
         axes.scatter(errors["fixed"], errors["policy"])
         axes.axline((0, 0), slope=1, color="0.5", linewidth=1)

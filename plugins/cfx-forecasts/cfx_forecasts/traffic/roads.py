@@ -18,7 +18,6 @@ import torch
 from torch import Tensor
 
 from cfx.plugin import (
-    SPEED_LIMIT,
     Agent,
     AgentState,
     DrivingModel,
@@ -27,8 +26,8 @@ from cfx.plugin import (
     Leader,
     MemoryStepper,
     Start,
-    WithSpeedLimit,
-    one_thread,
+    composed,
+    threads,
 )
 
 RoadKind = Literal["ring", "open", "platoon"]
@@ -319,7 +318,7 @@ def _lane(
 
 
 @torch.no_grad()
-@one_thread()
+@threads.one_thread()
 def simulate_roads(
     model: DrivingModel,
     agent: Agent,
@@ -344,7 +343,7 @@ def simulate_roads(
     """
     dt, windows = agent.dt, agent.windows
     stepper = agent.stepper(MemoryStepper(model, dt, compile="never"))
-    stepper = stepper.for_model(WithSpeedLimit(stepper.model))
+    stepper = stepper.for_model(composed.WithSpeedLimit(stepper.model))
     follower = stepper.begin(Start(lanes.position, lanes.speed, torch.zeros_like(lanes.speed)))
     ahead = lanes.leader(follower)
     seen = deque([_seen(follower, ahead)] * windows.length, maxlen=windows.length)
@@ -358,7 +357,7 @@ def simulate_roads(
         outside += state.score > 1.0
         p = agent.space.unpack(chosen)
         for _ in range(windows.stride):
-            p[SPEED_LIMIT] = lanes.limit(follower.position)
+            p[composed.SPEED_LIMIT] = lanes.limit(follower.position)
             now = Leader(
                 ahead.position[None], ahead.speed[None], ahead.acceleration[None], ahead.length
             )

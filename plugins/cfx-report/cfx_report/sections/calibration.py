@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.plugin import NEARLY_BEST, Purpose, Result, shortened, unit_label
-from cfx.plugin import number_text as shown
+from cfx.plugin import Purpose, Result, identifiability, wording
 from cfx_report.figures.calibration import (
     AT_BOUND,
     ParameterSpread,
@@ -75,7 +74,7 @@ def _labels(jobs: Sequence[Result]) -> dict[str, View]:
             axes = job.parameters
             drivers = labels_of(job.tables["labels"], job.pairs, axes)
             for pair_id, labels in drivers.items():
-                views[shortened(pair_id)] = View(draw_labels(pair_id, labels, axes))
+                views[wording.shortened(pair_id)] = View(draw_labels(pair_id, labels, axes))
         if views:
             return views
     return {}
@@ -126,13 +125,21 @@ def sheet(spreads: Sequence[ParameterSpread], panels: Sequence[SlicePanel] = ())
 
 def _name(row: _Row) -> Cell:
     axis = row.spread.axis
-    return Cell(unit_label(axis.name, axis.unit), second=axis.meaning)
+    return Cell(wording.unit_label(axis.name, axis.unit), second=axis.meaning)
 
 
 def _bounds(row: _Row) -> str:
     assert row.spread.axis.low is not None
     assert row.spread.axis.high is not None
-    return f"{shown(row.spread.axis.low)} to {shown(row.spread.axis.high)}"
+    return (
+        f"{wording.number_text(row.spread.axis.low)} to {wording.number_text(row.spread.axis.high)}"
+    )
+
+
+def _middle(row: Any) -> str:
+    """Returns the quantiles between which nine in ten of the drivers' values lie."""
+    low, high = row.quantile(0.05), row.quantile(0.95)
+    return f"{wording.number_text(low)} to {wording.number_text(high)}"
 
 
 _COLUMNS: tuple[Column[_Row], ...] = (
@@ -149,7 +156,7 @@ _COLUMNS: tuple[Column[_Row], ...] = (
     ),
     Column(
         "5 % to 95 %",
-        lambda row: f"{shown(row.quantile(0.05))} to {shown(row.quantile(0.95))}",
+        _middle,
         "Quantiles of the driver-specific values.",
     ),
     Column(
@@ -161,8 +168,9 @@ _COLUMNS: tuple[Column[_Row], ...] = (
     Column(
         "Flat on",
         lambda row: number(row.near, ".0%"),
-        f"Share of the range on which the loss is within {formatted(NEARLY_BEST, '.0%')} of its"
-        " best, the others held; median over pairs.",
+        "Share of the range on which the loss is within"
+        f" {formatted(identifiability.NEARLY_BEST, '.0%')} of its best, the others"
+        " held; median over pairs.",
     ),
     Column(
         "Flat for",

@@ -7,17 +7,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cfx.plugin import (
-    ALL_TYPES,
-    OWN,
-    Purpose,
-    Result,
-    installed,
-    name_of_indicator,
-    percent,
-    plural,
-    short_label,
-)
+from cfx.plugin import Purpose, Result, distributions, registry, style, wording
 from cfx_report.figures.improvements import BASE_LABELS, history_curves
 from cfx_report.figures.trajectories import RankedPair, draw_pair, rank_pairs
 from cfx_report.jobs import Runs, are_calibrations, of_purpose
@@ -72,7 +62,7 @@ class StyleSection(Section):
 
 def _group(row: Mapping[str, Any], prefix: str) -> str:
     site, kind = row[f"{prefix}site"], row[f"{prefix}driver_type"]
-    return str(site) if kind == ALL_TYPES else f"{site}, {kind}"
+    return str(site) if kind == style.ALL_TYPES else f"{site}, {kind}"
 
 
 _DISTANCES: tuple[Column[dict[str, Any]], ...] = (
@@ -91,7 +81,7 @@ _DISTANCES: tuple[Column[dict[str, Any]], ...] = (
     ),
     Column(
         "Differ most in",
-        lambda row: name_of_indicator(str(row["most"])),
+        lambda row: style.name_of_indicator(str(row["most"])),
         "The indicator whose normalised values, times its weight, are furthest apart.",
     ),
 )
@@ -117,7 +107,7 @@ class LearningSection(Section):
         for job in runs.jobs:
             table = job.tables.get("curves")
             if table is not None and len(table):
-                networks = plural(int(table["network"].nunique()), "network")
+                networks = wording.plural(int(table["network"].nunique()), "network")
                 learned.append((job.name, f"({networks})", job))
             elif table is not None:
                 without.append(job)
@@ -198,11 +188,11 @@ class FurtherSection(Section):
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return the figures."""
         shown: set[str] = set()
-        for section in installed("section"):
+        for section in registry.installed("section"):
             shown |= set(section.part.figures)
         further = []
-        for one in installed("figure"):
-            if one.distribution not in {OWN, "cfx-report"} and one.name not in shown:
+        for one in registry.installed("figure"):
+            if one.distribution not in {distributions.OWN, "cfx-report"} and one.name not in shown:
                 further.append(one)
         return {"further": further}
 
@@ -270,7 +260,8 @@ def pair_of(job: Result, pair_id: str) -> dict[str, View]:
 def _title(job: Result, pair: RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
     if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
-        title += f": {percent(pair.improvement, 1)} over {short_label('fixed')} calibration"
+        improvement = wording.percent(pair.improvement, 1)
+        title += f": {improvement} over {wording.short_label('fixed')} calibration"
     return title
 
 
@@ -278,5 +269,5 @@ def _errors_of_pair(job: Result, pair: RankedPair) -> str:
     row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
     errors = []
     for method in job.shown_methods:
-        errors.append(f"{short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
+        errors.append(f"{wording.short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
     return f"RMSE of speed (m/s): {', '.join(errors)}"

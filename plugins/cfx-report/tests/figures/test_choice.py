@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from cfx.data.style import StyleResult
 from cfx.evaluation.tables import scope_label
-from cfx.figures.text import common_prefix, shortened
+from cfx.figures.wording import common_prefix, shortened
 from cfx.results.result import ParameterAxis
 from cfx_report.figures.calibration import correlations, parameter_spreads, spread_offsets
 from cfx_report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars

@@ -15,8 +15,9 @@ from matplotlib.image import imread
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation, Purpose
+from cfx.figures.colours import COLOURS
 from cfx.figures.drawing import draw_figure, figure_named, write_figure, write_figures
-from cfx.figures.text import COLOURS, percent, pretty_unit, shortened, unit_label
+from cfx.figures.wording import percent, pretty_unit, shortened, unit_label
 from cfx.learners.curves import over_networks
 from cfx.results.result import Result
 from cfx_report.figures.improvements import amounts_of

@@ -13,7 +13,7 @@ from matplotlib import pyplot as plt
 
 from cfx.core import registry
 from cfx.core.distributions import OWN
-from cfx.figures.canvas import canvas, hover
+from cfx.figures.canvas import blank, hover
 from cfx.figures.drawing import draw_figure, write_figure, write_figures
 from cfx.results.figure import JobFigure
 from cfx.results.result import Result
@@ -137,7 +137,7 @@ def test_a_figure_of_what_was_not_measured_is_left_out(one: registry.Installed[J
 
 
 def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_shows() -> None:
-    figure = canvas(3.0)
+    figure = blank(3.0)
     axes = figure.subplots()
     axes.scatter(np.arange(1000), np.arange(1000))
     (line,) = axes.plot([0, 1], [0, 1])
@@ -153,7 +153,7 @@ def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_sh
 
 
 FURTHER = """
-    from cfx.figures.canvas import canvas
+    from cfx.figures.canvas import blank
     from cfx.results.figure import JobFigure
 
     class Further(JobFigure):
@@ -164,7 +164,7 @@ FURTHER = """
         order = 5
 
         def draw(self, results):
-            return canvas(2.0)
+            return blank(2.0)
 
     class Broken(Further):
         def draw(self, results):

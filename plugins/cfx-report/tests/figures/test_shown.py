@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from cfx.evaluation.result import Evaluation
-from cfx.figures.text import colour_of
+from cfx.figures.colours import colour_of
 from cfx.learners.curves import over_networks
 from cfx.results.result import Result
 from cfx_report.figures.calibration import correlations, draw_calibration, parameter_spreads
