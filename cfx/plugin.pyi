@@ -221,6 +221,11 @@ from .figures import (
     drawing as drawing,
     wording as wording,
 )
+from .results.figures import (
+    improvement_bars as improvement_bars,
+    pair_lines as pair_lines,
+    parameter_spread as parameter_spread,
+)
 
 # Sub-commands, formats of `cfx export`, engines; `main` runs a command line
 from .core import engine as engine

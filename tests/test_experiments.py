@@ -27,7 +27,7 @@ FILES = {
     for path in folder.rglob("*.yaml")
 }
 NAMES = sorted(FILES)
-SMALL = ["optimizer=random", "optimizer.samples=32", "figures.enabled=false", "learner.epochs=2"]
+SMALL = ["optimizer=random", "optimizer.samples=32", "figures=none", "learner.epochs=2"]
 
 
 @functools.cache
@@ -98,7 +98,7 @@ def test_one_pair_has_its_table_and_its_speed_plots(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.touch())
-    few = ["data.frames=120", "tracking.enabled=false", "figures.enabled=true"]
+    few = ["data.frames=120", "tracking.enabled=false", "figures=all"]
     result = cfx.run(["experiment=paper/pair", *SMALL, *few])
     assert result.pairs.method.tolist() == ["default", "fixed", "policy"]
     assert "speeds.png" in {path.name for path in result.figures}

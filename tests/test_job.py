@@ -31,7 +31,7 @@ QUICK = [
     "data.platoon_size=1",
     "data.frames=200",
     "data.max_pairs=null",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "calibration.prior=none",
 ]

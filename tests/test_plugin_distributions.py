@@ -227,8 +227,8 @@ def test_the_check_of_doors_sees_what_stands_beside_them(tmp_path: Path) -> None
         "cfx.data.describe describe",
         "cfx.plugin _x",
         "cfx.plugin gone",
-        "cfx.plugin.threads gone",
         "cfx job",
+        "cfx.plugin.threads gone",
     ]
 
 

@@ -26,7 +26,7 @@ import os
 import sys
 import traceback
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -37,7 +37,7 @@ from pydantic.fields import FieldInfo
 
 from cfx.core.component import API_VERSION, Component, Settings, validate
 from cfx.core.contract import violations
-from cfx.core.distributions import OWN, advice
+from cfx.core.distributions import ALL_OWN, OWN, advice
 from cfx.core.guest import same_environment
 from cfx.errors import CfxError, ConfigError, PluginError, Terminated, in_words, nearest
 
@@ -255,8 +255,11 @@ def entries(kind: str) -> tuple[Entry, ...]:
         PluginError: there is no such kind.
     """
     announced = _of_kind(kind_of(kind))
-    added = [one for one in _of_this_process.values() if one.kind == kind_of(kind).name]
-    return _sorted([*announced, *added])
+    every = list(announced)
+    for added in _of_this_process.values():
+        if added.kind == kind_of(kind).name:
+            every.append(added)
+    return _sorted(every)
 
 
 def names(kind: str) -> tuple[str, ...]:
@@ -273,9 +276,8 @@ def entry(kind: str, name: str) -> Entry:
     """
     about = kind_of(kind)
     call, what = about.call(name), about.name
-    every = [one for one in entries(kind) if one.name == name]
-    found = [one for one in every if one.distribution == OWN] or every
-    if not found:
+    claims = _that_count(_of_name(kind, name))
+    if not claims:
         known = names(kind)
         if not known and about.name in KINDS:
             raise PluginError(
@@ -283,12 +285,32 @@ def entry(kind: str, name: str) -> Entry:
                 " run make run, or pip install -e ."
             )
         raise PluginError(f"{call}: there is no {what} '{name}'.{advice(about.group, name, known)}")
-    if len(found) > 1:
-        claims = " and ".join(f"{one.distribution} {one.version} ({one.target})" for one in found)
+    if len(claims) > 1:
+        texts = []
+        for claim in claims:
+            texts.append(f"{claim.distribution} {claim.version} ({claim.target})")
         raise PluginError(
-            f"{call}: two distributions bring a {what} '{name}': {claims}; uninstall one of them"
+            f"{call}: two distributions bring a {what} '{name}': {' and '.join(texts)};"
+            " uninstall one of them"
         )
-    return found[0]
+    return claims[0]
+
+
+def _of_name(kind: str, name: str) -> list[Entry]:
+    """Returns the entries of a name, of whatever distribution."""
+    same_name = []
+    for announced in entries(kind):
+        if announced.name == name:
+            same_name.append(announced)
+    return same_name
+
+
+def _that_count(claims: list[Entry]) -> list[Entry]:
+    """Returns cfx's own of some entries of one name, which no other replaces; without it, all."""
+    for claim in claims:
+        if claim.distribution == OWN:
+            return [claim]
+    return claims
 
 
 def get(kind: str, name: str) -> type[Component]:
@@ -355,7 +377,8 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
             f"{group}.name: a value is required; choose a {kind}: {', '.join(names(kind))}"
         )
     cls, found = get(kind, name), entry(kind, name)
-    values = {key: value for key, value in node.items() if key != "name"}
+    values = dict(node)
+    del values["name"]
     settings = validate(cls.schema, _without_blanks(cls.schema, values), where=group)
     _warn_of_deprecated(found, cls, settings)
     try:
@@ -413,6 +436,33 @@ def installed(kind: str) -> tuple[Installed[Any], ...]:
     return _installed(kind, _search_path())
 
 
+def chosen(
+    kind: str, named: str | Iterable[str], distributions: Collection[str]
+) -> tuple[Installed[Any], ...]:
+    """Returns those of a kind that a job names, such as its tables and figures, in their order.
+
+    Args:
+        kind: whose components need no settings.
+        named: `own`: cfx's own, and those of the job's distributions; `all`: all that are
+            installed; `none`; or names, in which `own` may stand.
+        distributions: that bring the job's components.
+
+    Raises:
+        PluginError: there is none of a name.
+    """
+    if named == "all":
+        return installed(kind)
+    names = {named} if isinstance(named, str) else set(named)
+    for name in names - {ALL_OWN, "none"}:
+        get(kind, name)
+    components = []
+    for component in installed(kind):
+        is_own = component.distribution == OWN or component.distribution in distributions
+        if component.name in names or (ALL_OWN in names and is_own):
+            components.append(component)
+    return tuple(components)
+
+
 @functools.lru_cache(maxsize=8)
 def _installed(
     kind: str,
@@ -453,8 +503,11 @@ def rivals(found: Entry) -> tuple[Entry, ...]:
     """
     if found.distribution == OWN:
         return ()
-    others = [one for one in entries(found.kind) if one.name == found.name and one != found]
-    return tuple([one for one in others if one.distribution == OWN] or others)
+    others = []
+    for announced in _of_name(found.kind, found.name):
+        if announced != found:
+            others.append(announced)
+    return tuple(_that_count(others))
 
 
 def other_api(found: Entry) -> str:
@@ -464,7 +517,10 @@ def other_api(found: Entry) -> str:
     """
     if found.distribution == OWN or not found.api or str(API_VERSION) in found.api:
         return ""
-    versions = [int(one) for one in found.api if one.isdecimal()]
+    versions = []
+    for declared in found.api:
+        if declared.isdecimal():
+            versions.append(int(declared))
     if not versions:
         return (
             f"{found} declares '{found.api[0]}' as its version of cfx's plugin API, which is no"
@@ -483,7 +539,10 @@ def other_api(found: Entry) -> str:
 
 def _entry_of(cls: type) -> Entry | None:
     """Returns what announced a class; None if no distribution did."""
-    return next((found for found, loaded in _loaded.items() if loaded is cls), None)
+    for announced, loaded in _loaded.items():
+        if loaded is cls:
+            return announced
+    return None
 
 
 def origin(component: Component | type[Component]) -> str:
@@ -588,17 +647,25 @@ def _announced(
             seen.add(announced[0][1].distribution)
             for group, one in announced:
                 found.setdefault(group, []).append(one)
-    return {group: _sorted(ones) for group, ones in found.items()}
+    by_group = {}
+    for group, announced_there in found.items():
+        by_group[group] = _sorted(announced_there)
+    return by_group
 
 
 def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[str, Entry]]:
     """Yields what one distribution announces, each with its entry-point group."""
-    kinds = {kind.entry_points: kind.name for kind in (*KINDS.values(), *PARTS.values())}
-    points = [point for point in distribution.entry_points if point.group.startswith("cfx.")]
-    api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
-    ours = [point for point in points if point.group != API_GROUP]
+    api, ours = [], []
+    for point in distribution.entry_points:
+        if point.group == API_GROUP:
+            api.append(point.name)
+        elif point.group.startswith("cfx."):
+            ours.append(point)
     if not ours:
         return
+    kinds = {}
+    for about in (*KINDS.values(), *PARTS.values()):
+        kinds[about.entry_points] = about.name
     metadata = distribution.metadata  # read anew each time that it is asked for
     name, version = metadata["Name"], metadata["Version"]
     if not isinstance(name, str) or not isinstance(version, str):
@@ -607,8 +674,12 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[st
     location = str(distribution.locate_file(""))
     for point in ours:
         kind = kinds.get(point.group, point.group.removeprefix("cfx.").removesuffix("s"))
-        one = Entry(kind, point.name, point.value, name, version, location, summary, api)
-        yield point.group, one
+        yield (
+            point.group,
+            Entry(
+                kind, point.name, point.value, name, version, location, summary, tuple(sorted(api))
+            ),
+        )
 
 
 def _import(found: Entry) -> Any:
@@ -743,5 +814,5 @@ def _places(module: str) -> list[Path]:
         spec = None
     if spec is None:
         return []
-    places = [*(spec.submodule_search_locations or ()), spec.origin]
-    return [Path(place).resolve() for place in places[:1] if place is not None]
+    first = next(iter(spec.submodule_search_locations or ()), spec.origin)
+    return [] if first is None else [Path(first).resolve()]

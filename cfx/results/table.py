@@ -9,7 +9,7 @@ reports and figures (`Result.tables`) read them back.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -23,7 +23,6 @@ import pyarrow.parquet as pq
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.distributions import ALL_OWN, OWN
 from cfx.core.files import atomic_write
 from cfx.core.job_folder import unreadable
 from cfx.core.memory import in_units, total_memory
@@ -188,32 +187,6 @@ class Tables(Mapping[str, pd.DataFrame]):
 def installed() -> tuple[registry.Installed[ResultTable], ...]:
     """Returns all tables in their order; a broken one of a plugin is left out with a warning."""
     return registry.installed("table")
-
-
-def chosen_tables(
-    chosen: str | Sequence[str], plugins: Collection[str]
-) -> tuple[registry.Installed[ResultTable], ...]:
-    """Returns the tables that a job writes, in their order.
-
-    Args:
-        chosen: `own`: cfx's own, and those of the plugins whose components the job has; `all`: all
-            that are installed; or names, in which `own` may stand.
-        plugins: the distributions of the job's components.
-
-    Raises:
-        PluginError: there is no table of a name.
-    """
-    if chosen == "all":
-        return installed()
-    names = {chosen} if isinstance(chosen, str) else set(chosen)
-    for name in names - {ALL_OWN}:
-        registry.get("table", name)
-    tables = []
-    for table in installed():
-        is_own = table.distribution == OWN or table.distribution in plugins
-        if table.name in names or (ALL_OWN in names and is_own):
-            tables.append(table)
-    return tuple(tables)
 
 
 def file_of(table: registry.Installed[ResultTable]) -> str:

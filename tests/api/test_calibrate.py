@@ -57,7 +57,7 @@ def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
         found.append(calibrated(self, *given))
         return found[-1]
 
-    off = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+    off = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
     folder = tmp_path_factory.mktemp("job") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Calibrator, "fixed", recorded)
@@ -98,7 +98,7 @@ def test_a_posterior_is_that_of_the_command_and_gives_new_drivers(
     pairs: cfx.Pairs, tmp_path: Path
 ) -> None:
     fit = cfx.calibrate(pairs, "krauss", **RANDOM, **{"calibration.posterior": "hierarchical"})
-    off = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+    off = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
     folder = tmp_path / "job"
     cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
     fits = pd.read_parquet(folder / "fits.parquet")

@@ -25,9 +25,9 @@ SMALL = {
     "policy.hidden_size": 4,
     "protocol.folds": 2,
     "learner.ensemble_size": 1,
-    "figures.enabled": False,
+    "figures": "none",
 }
-QUIET = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+QUIET = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
 
 
 @pytest.fixture(scope="module")

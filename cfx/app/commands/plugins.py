@@ -123,7 +123,8 @@ def _use(entry: registry.Entry, cls: Any) -> str:
         who = "Every job" if entry.distribution == OWN else f"A job with tables=[own,{name}]"
         return f"{who} writes {name}{cls.suffix} where it has rows of it."
     if entry.kind == "figure":
-        return f"Every job that has what it shows draws it: figures/{name}.png."
+        who = "Every job" if entry.distribution == OWN else f"A job with figures=[own,{name}]"
+        return f"{who} draws it where it has what it shows: figures/{name}.png."
     if entry.kind == "metric":
         who = "Every job" if entry.distribution == OWN else f"A job with metrics=[own,{name}]"
         return f"{who} measures it; with {kind.call(name)} no others but those that a job needs."

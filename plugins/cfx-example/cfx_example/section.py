@@ -1,4 +1,4 @@
-"""A section of the report. This one says how many frames each job was tested on.
+"""A section of the report. This one says how fast the drivers of each job were.
 
 `cfx report` calls `context` once for its page, and fills the template with what it gives; a section
 that gives None is left out.
@@ -20,24 +20,33 @@ def name(job: Result) -> str:
 
 
 def frames(job: Result) -> Cell:
-    """Returns how many frames of all pairs were tested."""
-    return number(job.pairs.query("method == 'default'")["frames"].sum(), ".0f")
+    """Returns how many frames were measured."""
+    return number(job.tables["speed_bins"]["frames"].sum(), ".0f")
 
 
-class FrameCounts(Section):
-    """A row per job."""
+def highest(job: Result) -> Cell:
+    """Returns the lower end of the highest bin of speed."""
+    return number(job.tables["speed_bins"]["speed"].max(), ".0f")
 
-    title = "Frames of the test parts"
-    entry = "Frames"
+
+class MeasuredSpeeds(Section):
+    """A row for each job that has the table `speed_bins`."""
+
+    title = "Measured speeds"
+    entry = "Speeds"
     order = 250
     template = """
-    <p>Frames that are compared.</p>
+    <p>The speeds of the followers, as they were recorded.</p>
     {{ table(sheet, explain=true) }}
     """
 
-    def context(self, runs: Runs) -> Mapping[str, Any]:
+    def context(self, runs: Runs) -> Mapping[str, Any] | None:
+        jobs = [job for job in runs.jobs if "speed_bins" in job.tables]
+        if not jobs:
+            return None
         columns: tuple[Column[Result], ...] = (
             Column("Job", name),
             Column("Frames", frames, "Over all pairs."),
+            Column("Highest (m/s)", highest, "The lower end of the highest bin, 1 m/s wide."),
         )
-        return {"sheet": Sheet.of(columns, runs.jobs)}
+        return {"sheet": Sheet.of(columns, jobs)}

@@ -18,7 +18,7 @@ QUICK = [
     "data.platoon_size=1",
     "data.frames=400",
     "data.max_pairs=null",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
 ]
 

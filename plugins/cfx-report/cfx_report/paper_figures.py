@@ -104,8 +104,9 @@ def draw(
     from cfx.plugin import canvas, drawing, registry, wording
     from cfx_report.runs import read_runs
 
-    known = sorted(one.name for one in registry.installed("figure"))
-    names = None if only is None else _words(only, "--only", known)
+    figures = {figure.name: figure for figure in registry.installed("figure")}
+    if only is not None:
+        figures = {name: figures[name] for name in _words(only, "--only", sorted(figures))}
     jobs = read_runs(runs).jobs
     said = []
     with canvas.on_paper(canvas.Paper(width_mm / 25.4, font_size)):
@@ -115,9 +116,9 @@ def draw(
                 own = Path(folder or "figures").expanduser()
                 if len(jobs) > 1:
                     own /= job.name
-            paths = drawing.write_figures(own, job, formats=formats, names=names)
+            paths = drawing.write_figures(own, job, figures.values(), formats=formats)
             said.append(f"{wording.plural(len(paths), 'file')} in {own.absolute()}")
-        if len(jobs) > 1 and names is None:
+        if len(jobs) > 1 and only is None:
             said += _compared(jobs, Path(folder or "figures").expanduser(), formats)
     return said
 

@@ -43,7 +43,7 @@ QUICK = [
     "data.pairs=6",
     "data.platoon_size=1",
     "data.frames=200",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "calibration.prior=none",
 ]

@@ -6,8 +6,15 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from cfx.plugin import JobFigure, PairTrajectory, Result, canvas, colours, wording
-from cfx_report.figures.trajectories import chosen_pairs
+from cfx.plugin import (
+    JobFigure,
+    PairTrajectory,
+    Result,
+    canvas,
+    colours,
+    pair_lines,  # pair_lines
+    wording,
+)
 
 _PAIRS = 3
 
@@ -65,5 +72,5 @@ class Following(JobFigure):
         for method in result.shown_methods:
             if method in result.trajectories[0].speed and method not in canvas.HIDDEN:
                 methods.append(method)
-        pairs = [trajectory for _, trajectory in chosen_pairs(result, None, _PAIRS)]
+        pairs = [trajectory for _, trajectory in pair_lines.chosen_pairs(result, None, _PAIRS)]
         return draw_following(pairs, methods)

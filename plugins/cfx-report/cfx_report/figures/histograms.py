@@ -9,8 +9,14 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.plugin import JobFigure, Result, canvas, colours, wording
-from cfx_report.figures.calibration import ParameterSpread, parameter_spreads
+from cfx.plugin import (
+    JobFigure,
+    Result,
+    canvas,
+    colours,
+    parameter_spread,  # parameter_spread
+    wording,
+)
 
 _ACROSS = 5
 _BINS = (6, 30)
@@ -18,7 +24,7 @@ _BINS = (6, 30)
 
 
 @canvas.styled
-def draw_histograms(spreads: Sequence[ParameterSpread]) -> Figure:
+def draw_histograms(spreads: Sequence[parameter_spread.ParameterSpread]) -> Figure:
     """Draws a panel per parameter: how many pairs have which driver-specific value.
 
     Bins lie between the bounds. Lines mark the default and the pooled values.
@@ -40,7 +46,7 @@ def draw_histograms(spreads: Sequence[ParameterSpread]) -> Figure:
     return figure
 
 
-def _histogram(axes: Axes, spread: ParameterSpread) -> None:
+def _histogram(axes: Axes, spread: parameter_spread.ParameterSpread) -> None:
     assert spread.axis.low is not None
     assert spread.axis.high is not None
     bins = int(np.clip(2 * np.sqrt(len(spread.values)), *_BINS))
@@ -85,5 +91,5 @@ class ParameterHistograms(JobFigure):
 
     def draw(self, result: Result) -> Figure | None:
         """Draws it where drivers have parameters of their own."""
-        spreads = parameter_spreads(result.pairs, result.parameters)
+        spreads = parameter_spread.parameter_spreads(result.pairs, result.parameters)
         return draw_histograms(spreads) if spreads else None

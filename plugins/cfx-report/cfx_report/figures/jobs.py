@@ -12,13 +12,14 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter
 
-from cfx.plugin import Improvement, canvas, colours, style, wording
-from cfx_report.figures.calibration import spread_offsets
-from cfx_report.figures.improvements import (
-    ImprovementAxis,
-    ImprovementBars,
-    improvement_axis,
-    vertical_improvements,
+from cfx.plugin import (
+    Improvement,
+    canvas,
+    colours,
+    improvement_bars,  # improvement_bars
+    parameter_spread,  # parameter_spread
+    style,
+    wording,
 )
 
 _WIDE = 1.6
@@ -53,13 +54,15 @@ class ClusterGroup:
     values: canvas.Array
 
 
-def statistics_axis(found: Iterable[Improvement], baseline: str) -> ImprovementAxis:
+def statistics_axis(
+    found: Iterable[Improvement], baseline: str
+) -> improvement_bars.ImprovementAxis:
     """Return the axis of several jobs' statistics."""
     values: list[float] = []
     for one in found:
         values += canvas.finite([getattr(one, name) for name in _SHOWN]).tolist()
     what = "means, medians and ends of intervals"
-    return improvement_axis(np.array(values), baseline=baseline, what=what)
+    return improvement_bars.improvement_axis(np.array(values), baseline=baseline, what=what)
 
 
 def error_limit(values: Mapping[str, canvas.Array], unit: str) -> tuple[float, str]:
@@ -89,7 +92,9 @@ def error_limit(values: Mapping[str, canvas.Array], unit: str) -> tuple[float, s
 
 
 @canvas.styled
-def draw_overview(found: Mapping[str, Improvement], baseline: str, axis: ImprovementAxis) -> Figure:
+def draw_overview(
+    found: Mapping[str, Improvement], baseline: str, axis: improvement_bars.ImprovementAxis
+) -> Figure:
     """Draw mean improvement with its 95 % interval, trimmed mean and median: a line per job."""
     figure, axes, places = _by_job(list(found))
     colour = colours.colour_of(baseline)
@@ -151,7 +156,7 @@ def draw_error_dots(
 
 
 @canvas.styled
-def draw_clusters(groups: Sequence[ClusterGroup], axis: ImprovementAxis) -> Figure:
+def draw_clusters(groups: Sequence[ClusterGroup], axis: improvement_bars.ImprovementAxis) -> Figure:
     """Draw the improvement by cluster: a box and its pairs for each group of jobs."""
     figure = canvas.blank(4.4)
     axes = figure.subplots()
@@ -171,7 +176,7 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: ImprovementAxis) -> Figu
                 continue
             centre = place + (k - 0.5 * (len(groups) - 1)) * width
             _box(axes, values, centre, 0.8 * width, colour)
-            offsets = 0.25 * width * spread_offsets(len(values))
+            offsets = 0.25 * width * parameter_spread.spread_offsets(len(values))
             pairs = canvas.draw_points(axes, centre + offsets, values, "o", colour, 3.5, alpha=0.6)
             pairs.set(markeredgewidth=0)
     axes.axhline(0, color=colours.INK, linewidth=0.9, zorder=1)
@@ -179,7 +184,7 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: ImprovementAxis) -> Figu
     axes.set_xlim(-0.6, max(len(order), 1) - 0.4)
     axes.grid(visible=False, axis="x")
     axes.set_xlabel("cluster of driving style")
-    vertical_improvements(axes, axis)
+    improvement_bars.vertical_improvements(axes, axis)
     canvas.legend_above(figure, handles)
     return figure
 
@@ -202,7 +207,7 @@ def _box(axes: Axes, values: canvas.Array, centre: float, width: float, colour: 
 
 
 @canvas.styled
-def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
+def draw_every_pair(bars: improvement_bars.ImprovementBars, pair_ids: Sequence[str]) -> Figure:
     """Draws the improvement of every pair, of all jobs beside each other.
 
     Args:
@@ -248,7 +253,7 @@ def draw_every_pair(bars: ImprovementBars, pair_ids: Sequence[str]) -> Figure:
     axes.grid(visible=False, axis="x")
     of_what = f" of {wording.shortened(prefix.rstrip('_-/:.'), 30)}" if prefix else ""
     axes.set_xlabel(f"{wording.plural(len(pair_ids), 'pair')} of a leader and a follower{of_what}")
-    vertical_improvements(axes, bars.axis)
+    improvement_bars.vertical_improvements(axes, bars.axis)
     canvas.legend_above(figure, handles)
     return figure
 

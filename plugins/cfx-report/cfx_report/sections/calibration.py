@@ -8,16 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.plugin import Purpose, Result, identifiability, wording
-from cfx_report.figures.calibration import (
-    AT_BOUND,
-    ParameterSpread,
-    SlicePanel,
-    draw_labels,
-    labels_of,
-    parameter_spreads,
-    slice_panels,
+from cfx.plugin import (
+    Purpose,
+    Result,
+    identifiability,
+    parameter_spread,  # parameter_spread
+    wording,
 )
+from cfx_report.figures.calibration import SlicePanel, draw_labels, labels_of, slice_panels
 from cfx_report.jobs import Runs, of_purpose
 from cfx_report.section import Cell, Column, Section, Sheet, View, formatted, job_names, number
 
@@ -87,12 +85,12 @@ def slices_of(job: Result) -> tuple[SlicePanel, ...]:
     return slice_panels(job.tables["slices"], job.parameters)
 
 
-def spreads_of(job: Result) -> tuple[ParameterSpread, ...]:
+def spreads_of(job: Result) -> tuple[parameter_spread.ParameterSpread, ...]:
     """Returns the spread of each tuned parameter of a job."""
-    return parameter_spreads(job.pairs, job.parameters)
+    return parameter_spread.parameter_spreads(job.pairs, job.parameters)
 
 
-def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:
+def _fingerprint(spreads: tuple[parameter_spread.ParameterSpread, ...]) -> str:
     found = hashlib.sha256()
     for spread in spreads:
         found.update(spread.axis.name.encode())
@@ -104,7 +102,7 @@ def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:
 class _Row(NamedTuple):
     """A parameter; `near` and `flat` as of `SlicePanel`, NaN where the loss was not examined."""
 
-    spread: ParameterSpread
+    spread: parameter_spread.ParameterSpread
     near: float
     flat: float
 
@@ -116,7 +114,9 @@ class _Row(NamedTuple):
         return float(self.spread.pooled.mean()) if len(self.spread.pooled) else np.nan
 
 
-def sheet(spreads: Sequence[ParameterSpread], panels: Sequence[SlicePanel] = ()) -> Sheet:
+def sheet(
+    spreads: Sequence[parameter_spread.ParameterSpread], panels: Sequence[SlicePanel] = ()
+) -> Sheet:
     """Returns a row per parameter."""
     examined = {panel.axis.name: (panel.near, panel.flat) for panel in panels}
     unknown = (np.nan, np.nan)
@@ -162,7 +162,8 @@ _COLUMNS: tuple[Column[_Row], ...] = (
     Column(
         "At the lower bound",
         lambda row: number(row.spread.at_low, ".0%"),
-        f"Share of the pairs within {formatted(AT_BOUND, '.0%')} of the range of it.",
+        f"Share of the pairs within {formatted(parameter_spread.AT_BOUND, '.0%')} of the range of"
+        " it.",
     ),
     Column("At the upper bound", lambda row: number(row.spread.at_high, ".0%"), "The same."),
     Column(

@@ -7,9 +7,16 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from cfx.plugin import Purpose, Result, distributions, registry, style, wording
-from cfx_report.figures.improvements import BASE_LABELS, history_curves
-from cfx_report.figures.trajectories import RankedPair, draw_pair, rank_pairs
+from cfx.plugin import (
+    Purpose,
+    Result,
+    distributions,
+    pair_lines,  # pair_lines
+    registry,
+    style,
+    wording,
+)
+from cfx_report.figures.history import BASE_LABELS, history_curves
 from cfx_report.jobs import Runs, are_calibrations, of_purpose
 from cfx_report.section import MOST, Column, Section, Sheet, View, interval, job_names, number
 
@@ -169,7 +176,7 @@ _AMOUNTS: tuple[Column[dict[str, Any]], ...] = (
 
 
 class FurtherSection(Section):
-    """Figures of other distributions that no section shows."""
+    """Figures of other distributions that a job has drawn and no section shows."""
 
     title = "Further figures"
     entry = "Further figures"
@@ -190,10 +197,14 @@ class FurtherSection(Section):
         shown: set[str] = set()
         for section in registry.installed("section"):
             shown |= set(section.part.figures)
+        drawn: set[str] = set()
+        for job in runs.jobs:
+            drawn |= {path.stem for path in job.figures}
         further = []
-        for one in registry.installed("figure"):
-            if one.distribution not in {distributions.OWN, "cfx-report"} and one.name not in shown:
-                further.append(one)
+        for figure in registry.installed("figure"):
+            is_other = figure.distribution not in {distributions.OWN, "cfx-report"}
+            if is_other and figure.name in drawn - shown:
+                further.append(figure)
         return {"further": further}
 
 
@@ -241,7 +252,7 @@ What lies outside a parameter's bounds is shaded.
         return {"jobs": jobs, "adapting": adapting, "constant": bool(constant), **shown}
 
 
-def chosen_pairs(job: Result) -> tuple[RankedPair, ...]:
+def chosen_pairs(job: Result) -> tuple[pair_lines.RankedPair, ...]:
     """Returns the best, the median and the worst pair; fewer if there are fewer."""
     present = [trajectory.pair_id for trajectory in job.trajectories]
     table = job.by_pair[job.by_pair["pair_id"].isin(present)]
@@ -249,15 +260,15 @@ def chosen_pairs(job: Result) -> tuple[RankedPair, ...]:
         gains = -table[f"rmse_speed/{job.judged}"].to_numpy(dtype=float)
     else:
         gains = table["improvement/fixed"].to_numpy(dtype=float)
-    return rank_pairs(table["pair_id"].astype(str).tolist(), gains)
+    return pair_lines.rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
 def pair_of(job: Result, pair_id: str) -> dict[str, View]:
     """Speed, gap and each tuned parameter of one pair of a job."""
-    return {"": View(draw_pair(job, pair_id))}
+    return {"": View(pair_lines.draw_pair(job, pair_id))}
 
 
-def _title(job: Result, pair: RankedPair) -> str:
+def _title(job: Result, pair: pair_lines.RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
     if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
         improvement = wording.percent(pair.improvement, 1)
@@ -265,7 +276,7 @@ def _title(job: Result, pair: RankedPair) -> str:
     return title
 
 
-def _errors_of_pair(job: Result, pair: RankedPair) -> str:
+def _errors_of_pair(job: Result, pair: pair_lines.RankedPair) -> str:
     row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
     errors = []
     for method in job.shown_methods:

@@ -11,8 +11,15 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from cfx.plugin import Improvement, Purpose, Result, job_folder, style, wording
-from cfx_report.figures.improvements import improvement_axis, improvement_bars
+from cfx.plugin import (
+    Improvement,
+    Purpose,
+    Result,
+    improvement_bars,  # improvement_bars
+    job_folder,
+    style,
+    wording,
+)
 from cfx_report.figures.jobs import ClusterGroup, draw_clusters, draw_every_pair
 from cfx_report.jobs import Runs, any_baselines, of_purpose
 from cfx_report.names import SEPARATOR, differences
@@ -77,7 +84,9 @@ def _view(jobs: Sequence[Result], tables: Sequence[pd.DataFrame], baseline: str)
             pair_ids.append(table["key"].tolist())
             improvements.append(table[column].to_numpy(dtype=float))
             marks += [getattr(job.statistics(baseline), statistic) for statistic in _STATISTICS]
-    bars = improvement_bars(names, pair_ids, improvements, baseline=baseline, marks=marks)
+    bars = improvement_bars.improvement_bars(
+        names, pair_ids, improvements, baseline=baseline, marks=marks
+    )
     # Best to worst of the first job; pairs that only others have follow.
     keys: dict[str, None] = {}
     for series in bars.series:
@@ -193,7 +202,7 @@ def per_cluster(series: Series, baselines: Sequence[str]) -> dict[str, View]:
             if tables:
                 groups.append(_group(name, pd.concat(tables, ignore_index=True), column))
         every = np.concatenate([np.empty(0), *(group.values for group in groups)])
-        axis = improvement_axis(every, baseline=baseline)
+        axis = improvement_bars.improvement_axis(every, baseline=baseline)
         views[f"against {wording.method_label(baseline)}"] = View(
             draw_clusters(groups, axis), axis.note
         )

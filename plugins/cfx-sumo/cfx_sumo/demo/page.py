@@ -149,13 +149,13 @@ class _Plot(NamedTuple):
 
 def _plots(evaluation: Evaluation) -> list[_Plot]:
     """Draws each pair; the axes' places are where the page puts its line of time."""
-    from cfx_report.figures.trajectories import draw_pair
+    from cfx.plugin import pair_lines  # pair_lines
     from cfx_report.inline import PLACE, inline_svg
 
     result = Result.of(evaluation)
     found = []
     for k, trajectory in enumerate(evaluation.trajectories):
-        figure = draw_pair(result, trajectory.pair_id)
+        figure = pair_lines.draw_pair(result, trajectory.pair_id)
         svg = inline_svg(figure).replace(PLACE, f"plot-{k}-")
         axes = []
         for one in figure.axes:

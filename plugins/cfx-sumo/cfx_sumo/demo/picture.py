@@ -11,8 +11,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Patch
 from matplotlib.transforms import Affine2D
 
-from cfx.plugin import Evaluation, Result, canvas, colours, drawing, wording
-from cfx_report.figures.trajectories import drives
+from cfx.plugin import (
+    Evaluation,
+    Result,
+    canvas,
+    colours,
+    drawing,
+    pair_lines,  # pair_lines
+    wording,
+)
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
 from cfx_sumo.demo.simulated import Array, SimulatedPair
@@ -40,7 +47,7 @@ def write_pictures(
     middle = simulated[len(simulated) // 2]
     together = [one for one in simulated if one.scene == middle.scene]
     picture = drawing.write_figure(snapshots(road, middle, together), folder / "demo.png")
-    trajectories = drives(Result.of(evaluation), [one.pair.pair_id for one in simulated])
+    trajectories = pair_lines.drives(Result.of(evaluation), [one.pair.pair_id for one in simulated])
     return [picture, drawing.write_figure(trajectories, folder / "demo_drives.png")]
 
 

@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
-from cfx.plugin import JobFigure, Result, canvas, colours, curves
+from cfx.figures import canvas, colours
+from cfx.learners import curves
+from cfx.results.figure import JobFigure
+
+if TYPE_CHECKING:
+    from cfx.results.result import Result
 
 LOSS_TITLE = "loss (as the learner defines it)"
 SAMPLED = "training counts sampled paths, too (CRPS)"

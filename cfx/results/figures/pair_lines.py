@@ -6,7 +6,7 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -17,8 +17,25 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from cfx.errors import ConfigError, nearest
-from cfx.plugin import JobFigure, PairTrajectory, ParameterAxis, Result, canvas, colours, wording
-from cfx_report.figures.improvements import improvement_title
+from cfx.figures import canvas, colours, wording
+from cfx.results.figure import JobFigure
+from cfx.results.figures.improvement_bars import improvement_title
+
+if TYPE_CHECKING:
+    from cfx.evaluation.result import PairTrajectory
+    from cfx.results.result import ParameterAxis, Result
+
+__all__ = [
+    "TIME_TITLE",
+    "RankedPair",
+    "chosen_pairs",
+    "draw_pair",
+    "drives",
+    "evenly_spread",
+    "rank_pairs",
+]
+"""What plugins may use, as `cfx.plugin.pair_lines`."""
+
 
 TIME_TITLE = "time from the start of the pair (s)"
 
