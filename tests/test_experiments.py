@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 import cfx
 from cfx.app import cli, hydra_source, nodes
-from tests.checkout import DISTRIBUTIONS, ROOT, is_installed, needs
+from tests.checkout import DISTRIBUTIONS, ROOT, is_installed
 
 FOLDER = nodes.conf_dir() / "experiment"
 FOLDERS = [FOLDER]
@@ -92,13 +92,12 @@ def test_an_experiment_sweeps_without_being_told(
         assert "rmse_improvement/population/mean" in json.loads((job / "metrics.json").read_text())
 
 
-@needs("cfx-report")
 def test_one_pair_has_its_table_and_its_speed_plots(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.touch())
-    few = ["data.frames=120", "tracking.enabled=false", "figures=all"]
+    few = ["data.frames=120", "tracking.enabled=false", "figures=own"]
     result = cfx.run(["experiment=paper/pair", *SMALL, *few])
     assert result.pairs.method.tolist() == ["default", "fixed", "policy"]
     assert "speeds.png" in {path.name for path in result.figures}

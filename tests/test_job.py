@@ -77,7 +77,7 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.plugin.Result) ->
         "cfx.log",
     } <= names
     assert {path.name for path in finished.figures} >= {
-        "style_distribution.png",
+        "speeds.png",
         "drives.png",
         "chosen_parameters.png",
         "improvement_per_driver.png",

@@ -187,7 +187,10 @@ def _counts(jobs: Sequence[Result]) -> str:
         ("fixed", f"Of {len(jobs)} jobs"),
         ("population", "against pooled calibration"),
     ):
-        sides = [_side(job, baseline) for job in jobs if baseline in job.baselines()]
+        sides = []
+        for job in jobs:
+            if baseline in job.baselines():
+                sides.append(_side(job, baseline))
         if sides:
             counts = ", ".join(
                 f"{side} in {sides.count(side)}" for side in ("yes", "no", "undecided")
@@ -198,7 +201,10 @@ def _counts(jobs: Sequence[Result]) -> str:
 
 def _best(jobs: Sequence[Result]) -> str:
     """Says which job improves most, or which jobs over their seeds: no lucky seed is picked."""
-    rows = [row for row in rows_over_seeds(jobs) if of_purpose(row.jobs, Purpose.ADAPTATION)]
+    rows = []
+    for row in rows_over_seeds(jobs):
+        if of_purpose(row.jobs, Purpose.ADAPTATION):
+            rows.append(row)
     best = max(rows, key=_mean_for_ranking)
     if len(best.jobs) == 1:
         return f"The best mean: {_verdict(best.jobs[0])}"

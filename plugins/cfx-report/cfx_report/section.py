@@ -97,7 +97,10 @@ def lacking(jobs: tuple[Result, ...], file: str, what: str) -> str:
         file: its name.
         what: what cannot be shown without it.
     """
-    without = [job.name for job in jobs if file in job.missing]
+    without = []
+    for job in jobs:
+        if file in job.missing:
+            without.append(job.name)
     if not without:
         return ""
     reason = "an older version of cfx wrote it, or the file was removed"

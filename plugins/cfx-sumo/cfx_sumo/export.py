@@ -120,7 +120,10 @@ def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[st
     """
     model = cast(DrivingModel, registry.create("model", node))
     columns = [f"parameter_{name}" for name in model.space.names]
-    missing = [column for column in columns if column not in table]
+    missing = []
+    for column in columns:
+        if column not in table:
+            missing.append(column)
     if missing:
         raise DataError(
             f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the"
@@ -236,9 +239,10 @@ def _undetermined(table: pd.DataFrame) -> list[str]:
 
 def _flat(table: pd.DataFrame, row: Any) -> list[str]:
     """Returns the parameters whose loss is flat for the driver of a row, by cfx's names."""
-    columns = [
-        str(name) for name in table if str(name).startswith(identifiability.FLAT_SHARE_PREFIX)
-    ]
+    columns = []
+    for name in table:
+        if str(name).startswith(identifiability.FLAT_SHARE_PREFIX):
+            columns.append(str(name))
     return [
         name.removeprefix(identifiability.FLAT_SHARE_PREFIX)
         for name in columns

@@ -260,7 +260,10 @@ def _types(rows: FcdRows) -> tuple[tuple[str, ...], Ints]:
 def _warn_of_lengths(rows: FcdRows, types: tuple[str, ...], settings: SumoFcdSettings) -> None:
     """Warns of vTypes whose length is nothing but the default: their gaps may be wrong."""
     known = _LENGTH_IS_SUMOS | set(settings.lengths or {})
-    guessed = [name for name in types if name not in known]
+    guessed = []
+    for name in types:
+        if name not in known:
+            guessed.append(name)
     if guessed:
         log.warning(
             "%s does not say how long vehicles are: those of type %s count as %g m, and gaps behind"

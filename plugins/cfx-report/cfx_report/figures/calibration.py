@@ -130,12 +130,18 @@ def labels_of(
         the window, as a share of the 90 % quantile over all windows (0 is arbitrary), and
         `fixed_NAME`, the driver-specific parameters.
     """
-    names = [axis.name for axis in axes if f"parameter_{axis.name}" in labels]
+    names = []
+    for axis in axes:
+        if f"parameter_{axis.name}" in labels:
+            names.append(axis.name)
     if labels.empty or not names:
         return {}
     own = pairs[pairs["method"] == "fixed"].drop_duplicates("pair_id").set_index("pair_id")
     ids = labels["pair_id"].astype(str)
-    known = [one for one in own.index.astype(str) if one in set(ids)]
+    known = []
+    for one in own.index.astype(str):
+        if one in set(ids):
+            known.append(one)
     if not known:
         return {}
     scale = float(np.quantile(labels["sensitivity"].to_numpy(dtype=float), 0.9)) or 1.0

@@ -58,7 +58,10 @@ class ErrorDistribution(JobFigure):
 
     def draw(self, result: Result) -> Figure | None:
         """Draws it where several pairs were driven by calibrated parameters or a policy."""
-        methods = [method for method in result.shown_methods if method not in canvas.HIDDEN]
+        methods = []
+        for method in result.shown_methods:
+            if method not in canvas.HIDDEN:
+                methods.append(method)
         if result.pairs["pair_id"].nunique() < _FEWEST or set(methods) <= {"default"}:
             return None
         return draw_error_distribution(result.pairs, methods)

@@ -251,7 +251,10 @@ class PosteriorIntervals(JobFigure):
         if fits is None:
             return None
         rows = interval_rows(fits)
-        axes = [axis for axis in result.parameters if f"median_{axis.name}" in rows]
+        axes = []
+        for axis in result.parameters:
+            if f"median_{axis.name}" in rows:
+                axes.append(axis)
         return draw_intervals(rows, axes) if len(rows) and axes else None
 
 
@@ -274,7 +277,10 @@ class PosteriorPairs(JobFigure):
             return None
         pair_id = _middle(interval_rows(fits))
         own = draws[draws["pair_id"].astype(str) == pair_id]
-        axes = [axis for axis in result.parameters if f"parameter_{axis.name}" in own]
+        axes = []
+        for axis in result.parameters:
+            if f"parameter_{axis.name}" in own:
+                axes.append(axis)
         prior = result.tables.get("population", result.tables.get("prior"))
         return draw_pairs(pair_id, own, axes, prior) if len(own) and axes else None
 

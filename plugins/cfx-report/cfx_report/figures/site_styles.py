@@ -110,7 +110,10 @@ def _called(group: style.Group) -> str:
 
 def _matrix(axes: Axes, shown: Sequence[style.Group], distances: pd.DataFrame | None) -> None:
     """Draws the distances between the scores of sites; pale where chance may explain them."""
-    sites = [group.site for group in shown if group.driver_type == style.ALL_TYPES]
+    sites = []
+    for group in shown:
+        if group.driver_type == style.ALL_TYPES:
+            sites.append(group.site)
     number = {site: index for index, site in enumerate(sites)}
     matrix = np.full((len(sites), len(sites)), np.nan)
     p_values = np.ones_like(matrix)

@@ -145,7 +145,10 @@ def closeness(jobs: Sequence[Result]) -> Sheet:
         (wording.FULL_TRAJECTORY, "Full trajectories: the same"),
     ):
         for method in METHODS:
-            showing = [job for job in jobs if method in job.shown_methods]
+            showing = []
+            for job in jobs:
+                if method in job.shown_methods:
+                    showing.append(job)
             if any_has_metric(showing, "rmse_speed", method, scope):
                 meaning = f"RMSE over {frames[scope]}, with {wording.explained(method)}."
                 cell = partial(_error, scope=scope, method=method)

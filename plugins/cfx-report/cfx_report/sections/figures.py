@@ -58,7 +58,10 @@ class StyleSection(Section):
                 jobs.setdefault(scoring, []).append(job)
         named = len(jobs) > 1
         scorings = [(job_names(one) if named else "", "", one[0]) for one in jobs.values()]
-        by_site = [one for one in scorings if "style_distances" in one[2].tables]
+        by_site = []
+        for one in scorings:
+            if "style_distances" in one[2].tables:
+                by_site.append(one)
         rows: list[dict[str, Any]] = []
         for name, _, job in by_site:
             for row in job.tables["style_distances"].to_dict("records"):
@@ -240,7 +243,10 @@ What lies outside a parameter's bounds is shaded.
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return the jobs that kept their trajectories, and what is shown of their pairs."""
-        jobs = [job for job in runs.jobs if "trajectories" in job.tables]
+        jobs = []
+        for job in runs.jobs:
+            if "trajectories" in job.tables:
+                jobs.append(job)
         constant = of_purpose(jobs, Purpose.CALIBRATION)
         shown = {
             "chosen": chosen_pairs,

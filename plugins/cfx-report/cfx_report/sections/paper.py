@@ -41,7 +41,10 @@ class PaperSection(Section):
         paper = published()
         found = []
         for experiment, about in paper["experiments"].items():
-            jobs = [job for job in runs.jobs if job.setting("preset") == experiment]
+            jobs = []
+            for job in runs.jobs:
+                if job.setting("preset") == experiment:
+                    jobs.append(job)
             if "ranked" in about:
                 jobs = _ranked(jobs, about["ranked"])
             if jobs:

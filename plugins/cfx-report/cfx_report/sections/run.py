@@ -184,7 +184,10 @@ def _command(overrides: Sequence[str]) -> str:
 
 def _shared_overrides(jobs: Sequence[Result]) -> list[str]:
     """Returns the overrides that all jobs with known overrides have, in order."""
-    known = [job.overrides for job in jobs if job.overrides is not None]
+    known = []
+    for job in jobs:
+        if job.overrides is not None:
+            known.append(job.overrides)
     shared = []
     for override in known[0]:
         if all(override in other for other in known):

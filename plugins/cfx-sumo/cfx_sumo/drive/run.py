@@ -533,7 +533,10 @@ class _Run:
         known = self._sumo.vehicletype.getIDList()
         for name in self._fleet.drivers:
             if name not in known:
-                own = [one for one in known if not one.startswith("DEFAULT_")]
+                own = []
+                for one in known:
+                    if not one.startswith("DEFAULT_"):
+                        own.append(one)
                 raise SumoError(
                     f"{self._scenario} has no vType '{name}'.{nearest(name, own)} It has:"
                     f" {', '.join(own) or 'none of its own'}. (A vType must stand ahead of the"

@@ -358,7 +358,10 @@ class Driver:
 
     def _hold(self, connection: Connection, names: list[str], now: float, clock: Clock) -> None:
         """Lets vehicles go on as they accelerate, in the steps between two of the model."""
-        driven = [name for name in names if self.drives(name)]
+        driven = []
+        for name in names:
+            if self.drives(name):
+                driven.append(name)
         if not driven:
             return
         table, rows = self._vehicles.table, self._vehicles.rows(driven)
