@@ -320,15 +320,15 @@ def get(kind: str, name: str) -> type[Component]:
         PluginError: the name is unknown or claimed twice; or the component was built for another
             version of the plugin API, cannot be imported, or breaks the contract of its kind.
     """
-    found = entry(kind, name)
-    if found not in _loaded:
-        complaint = other_api(found)
+    announced = entry(kind, name)
+    if announced not in _loaded:
+        complaint = other_api(announced)
         if complaint:
             raise PluginError(complaint)
-        cls = _import(found)
-        _check(found, cls)
-        _loaded[found] = cls
-    return _loaded[found]
+        cls = _import(announced)
+        _check(announced, cls)
+        _loaded[announced] = cls
+    return _loaded[announced]
 
 
 def add(kind: str, name: str, cls: type[Component]) -> None:
@@ -347,14 +347,14 @@ def add(kind: str, name: str, cls: type[Component]) -> None:
                 f"{other} is installed, and {about.call(name)} means it; choose another name"
             )
     target = f"{cls.__module__}:{cls.__qualname__}"
-    found = Entry(about.name, name, target, THIS_PROCESS, str(next(_additions)), "")
-    _check(found, cls)
+    announced = Entry(about.name, name, target, THIS_PROCESS, str(next(_additions)), "")
+    _check(announced, cls)
     cls.process_code = uuid.uuid4().hex
     before = _of_this_process.pop((about.name, name), None)
     if before is not None:
         _loaded.pop(before, None)
-    _of_this_process[about.name, name] = found
-    _loaded[found] = cls
+    _of_this_process[about.name, name] = announced
+    _loaded[announced] = cls
 
 
 def create(kind: str, node: Mapping[str, Any]) -> Component:
@@ -376,20 +376,20 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
         raise ConfigError(
             f"{group}.name: a value is required; choose a {kind}: {', '.join(names(kind))}"
         )
-    cls, found = get(kind, name), entry(kind, name)
+    cls, announced = get(kind, name), entry(kind, name)
     values = dict(node)
     del values["name"]
     settings = validate(cls.schema, _without_blanks(cls.schema, values), where=group)
-    _warn_of_deprecated(found, cls, settings)
+    _warn_of_deprecated(announced, cls, settings)
     try:
         component = cls(settings)
     except CfxError:
         raise
     except Exception as error:
         raise PluginError(
-            f"{found} cannot be created: {in_words(error)}{_remedy(found)}"
+            f"{announced} cannot be created: {in_words(error)}{_remedy(announced)}"
         ) from error
-    _try(found, component, settings)
+    _try(announced, component, settings)
     return component
 
 
@@ -469,19 +469,19 @@ def _installed(
     search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - part of the cache's key
 ) -> tuple[Installed[Any], ...]:
     made = []
-    for found in entries(kind):
-        others = rivals(found)
+    for announced in entries(kind):
+        others = rivals(announced)
         if others:
-            _warn_of_left_out(found, f"{others[0].distribution} brings one of that name")
+            _warn_of_left_out(announced, f"{others[0].distribution} brings one of that name")
             continue
         try:
-            part: Any = create(kind, {"name": found.name})
+            part: Any = create(kind, {"name": announced.name})
         except PluginError as error:
-            if found.distribution == OWN:
+            if announced.distribution == OWN:
                 raise
-            _warn_of_left_out(found, str(error))
+            _warn_of_left_out(announced, str(error))
             continue
-        made.append(Installed(kind, found.name, part, found.distribution))
+        made.append(Installed(kind, announced.name, part, announced.distribution))
     return tuple(sorted(made, key=lambda one: (one.part.order, one.name)))
 
 
@@ -491,49 +491,49 @@ def _warn_of_left_out(one: Entry | Installed[Any], reason: str) -> None:
     )
 
 
-def is_loaded(found: Entry) -> bool:
+def is_loaded(announced: Entry) -> bool:
     """Says whether the component was imported and passed its checks."""
-    return found in _loaded
+    return announced in _loaded
 
 
-def rivals(found: Entry) -> tuple[Entry, ...]:
+def rivals(announced: Entry) -> tuple[Entry, ...]:
     """Returns the entries of other distributions that keep this one from being used.
 
     It is empty for most. Imports nothing.
     """
-    if found.distribution == OWN:
+    if announced.distribution == OWN:
         return ()
     others = []
-    for announced in _of_name(found.kind, found.name):
-        if announced != found:
-            others.append(announced)
+    for other in _of_name(announced.kind, announced.name):
+        if other != announced:
+            others.append(other)
     return tuple(_that_count(others))
 
 
-def other_api(found: Entry) -> str:
+def other_api(announced: Entry) -> str:
     """Returns a sentence if the distribution was built for other versions of the plugin API only.
 
     Returns "" if it was not. Imports nothing.
     """
-    if found.distribution == OWN or not found.api or str(API_VERSION) in found.api:
+    if announced.distribution == OWN or not announced.api or str(API_VERSION) in announced.api:
         return ""
     versions = []
-    for declared in found.api:
+    for declared in announced.api:
         if declared.isdecimal():
             versions.append(int(declared))
     if not versions:
         return (
-            f"{found} declares '{found.api[0]}' as its version of cfx's plugin API, which is no"
-            f" number; its author must name the entry point of the group {API_GROUP} by one,"
+            f"{announced} declares '{announced.api[0]}' as its version of cfx's plugin API, which"
+            f" is no number; its author must name the entry point of the group {API_GROUP} by one,"
             f" such as {API_VERSION}"
         )
-    outdated = found.distribution
+    outdated = announced.distribution
     if min(versions) > API_VERSION:
         outdated = OWN
     return (
-        f"{found} was built for version {' and '.join(found.api)} of cfx's plugin API, this cfx has"
-        f" version {API_VERSION}; pip install --upgrade {outdated}, or pip uninstall"
-        f" {found.distribution}"
+        f"{announced} was built for version {' and '.join(announced.api)} of cfx's plugin API, this"
+        f" cfx has version {API_VERSION}; pip install --upgrade {outdated}, or pip uninstall"
+        f" {announced.distribution}"
     )
 
 
@@ -556,17 +556,17 @@ def origin(component: Component | type[Component]) -> str:
 
 def is_own(component: Component) -> bool:
     """Says whether a component is one of cfx's own."""
-    found = _entry_of(type(component))
-    return found is not None and found.distribution == OWN
+    announced = _entry_of(type(component))
+    return announced is not None and announced.distribution == OWN
 
 
 def name_of(component: Component) -> str:
     """Returns the name under which configs choose a component; its class's if it is none's."""
-    found = _entry_of(type(component))
-    return type(component).__name__ if found is None else found.name
+    announced = _entry_of(type(component))
+    return type(component).__name__ if announced is None else announced.name
 
 
-def _try(found: Entry, component: Component, settings: BaseModel) -> None:
+def _try(announced: Entry, component: Component, settings: BaseModel) -> None:
     """Holds a component to the first statements of its contract, once for each of its settings.
 
     Statements are assertions: python -O leaves this out.
@@ -574,37 +574,37 @@ def _try(found: Entry, component: Component, settings: BaseModel) -> None:
     Raises:
         PluginError: it breaks its contract; names the distribution.
     """
-    first = kind_of(found.kind).first
+    first = kind_of(announced.kind).first
     if not first or not __debug__:
         return
-    key = (found, settings.model_dump_json())
+    key = (announced, settings.model_dump_json())
     if key in _tried:
         return
     for _, sentence in violations(component, _resolve(first)):
-        raise PluginError(f"{found} breaks its contract: {sentence}{_remedy(found)}")
+        raise PluginError(f"{announced} breaks its contract: {sentence}{_remedy(announced)}")
     _tried.add(key)
 
 
-def _remedy(found: Entry) -> str:
-    if found.distribution == THIS_PROCESS:
+def _remedy(announced: Entry) -> str:
+    if announced.distribution == THIS_PROCESS:
         return "; repair it"
     return (
-        f"; repair that distribution (cfx plugins check {found.kind} {found.name}),"
-        f" or pip uninstall {found.distribution}"
+        f"; repair that distribution (cfx plugins check {announced.kind} {announced.name}),"
+        f" or pip uninstall {announced.distribution}"
     )
 
 
-def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel) -> None:
+def _warn_of_deprecated(announced: Entry, cls: type[Component], settings: BaseModel) -> None:
     """Logs a warning for a deprecated component, and for each deprecated setting that is set."""
     if cls.deprecated:
-        log.warning("%s is deprecated: %s", found, cls.deprecated)
+        log.warning("%s is deprecated: %s", announced, cls.deprecated)
     for name, field in cls.schema.model_fields.items():
         if not field.deprecated:
             continue
         default = field.get_default(call_default_factory=True, validated_data={})
         if settings.__dict__[name] != default:  # getattr would raise pydantic's own warning
-            path = f"{kind_of(found.kind).group}.{name}"
-            log.warning("%s of %s is deprecated: %s", path, found, field.deprecation_message)
+            path = f"{kind_of(announced.kind).group}.{name}"
+            log.warning("%s of %s is deprecated: %s", path, announced, field.deprecation_message)
 
 
 def _search_path() -> tuple[tuple[str, float], ...]:
@@ -622,8 +622,8 @@ def _search_path() -> tuple[tuple[str, float], ...]:
     return tuple(stamps)
 
 
-def _sorted(found: Iterable[Entry]) -> tuple[Entry, ...]:
-    return tuple(sorted(found, key=attrgetter("name", "distribution")))
+def _sorted(announced: Iterable[Entry]) -> tuple[Entry, ...]:
+    return tuple(sorted(announced, key=attrgetter("name", "distribution")))
 
 
 def _of_kind(kind: Kind) -> tuple[Entry, ...]:
@@ -682,8 +682,8 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[st
         )
 
 
-def _import(found: Entry) -> Any:
-    module, _, attribute = found.target.partition(":")
+def _import(announced: Entry) -> Any:
+    module, _, attribute = announced.target.partition(":")
     try:
         with same_environment():  # libraries set variables as they are imported
             imported = importlib.import_module(module)
@@ -692,48 +692,48 @@ def _import(found: Entry) -> Any:
         raise
     except BaseException as error:  # a plugin may raise anything, even SystemExit
         raise PluginError(
-            f"{found} cannot be imported: {in_words(error)};"
-            f" repair that distribution, or pip uninstall {found.distribution}"
+            f"{announced} cannot be imported: {in_words(error)};"
+            f" repair that distribution, or pip uninstall {announced.distribution}"
         ) from error
 
 
-def _check(found: Entry, cls: Any) -> None:
+def _check(announced: Entry, cls: Any) -> None:
     """Raises PluginError unless `cls` keeps the contract of its kind."""
-    base = _resolve(kind_of(found.kind).base)
+    base = _resolve(kind_of(announced.kind).base)
     if not inspect.isclass(cls):
         raise PluginError(
-            f"{found} is no class but {type(cls).__name__};"
+            f"{announced} is no class but {type(cls).__name__};"
             f" point its entry point at a subclass of {base.__name__}"
         )
     if not issubclass(cls, base):
-        raise PluginError(f"{found} does not extend {base.__module__}.{base.__name__}")
+        raise PluginError(f"{announced} does not extend {base.__module__}.{base.__name__}")
     missing = sorted(getattr(cls, "__abstractmethods__", ()))
     if missing:
-        raise PluginError(f"{found} does not implement {', '.join(missing)}")
+        raise PluginError(f"{announced} does not implement {', '.join(missing)}")
     if not issubclass(cls, Component):
         return
     if cls.kind != base.kind:
         raise PluginError(
-            f"{found} says kind='{cls.kind}',"
-            f" but a {found.kind} keeps kind='{base.kind}' of its base class"
+            f"{announced} says kind='{cls.kind}',"
+            f" but a {announced.kind} keeps kind='{base.kind}' of its base class"
         )
     schema = cls.schema
     if not (inspect.isclass(schema) and issubclass(schema, Settings)):
         raise PluginError(
-            f"{found}: its schema must be a subclass of cfx.plugin.Settings, not {schema!r}"
+            f"{announced}: its schema must be a subclass of cfx.plugin.Settings, not {schema!r}"
         )
     if "name" in schema.model_fields:
         raise PluginError(
-            f"{found}: its settings must not have a field 'name',"
+            f"{announced}: its settings must not have a field 'name',"
             " which chooses the component itself"
         )
-    if found.kind in {"model", "simulator"} and not issubclass(schema, base.schema):
+    if announced.kind in {"model", "simulator"} and not issubclass(schema, base.schema):
         raise PluginError(
-            f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
+            f"{announced}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
         )
     complaint = cls.complaint()
     if complaint:
-        raise PluginError(f"{found}{complaint}")
+        raise PluginError(f"{announced}{complaint}")
 
 
 def _resolve(target: str) -> Any:
@@ -785,25 +785,25 @@ def blame(
         file = Path(frame.filename).resolve()
         if file.is_relative_to(_PACKAGE):
             return None
-        for package, found in packages.items():
+        for package, announced in packages.items():
             if file.is_relative_to(package):
                 where = f"{file.relative_to(package.parent)}, line {frame.lineno}"
                 return PluginError(
-                    f"{found} failed in {where}: {failure}; {more};"
-                    f" repair that distribution, or pip uninstall {found.distribution}"
+                    f"{announced} failed in {where}: {failure}; {more};"
+                    f" repair that distribution, or pip uninstall {announced.distribution}"
                 )
     return None
 
 
 def _packages() -> dict[Path, Entry]:
     """Returns the places of plugins' code: a package's folder, or a single module's file."""
-    found: dict[Path, Entry] = {}
+    by_place: dict[Path, Entry] = {}
     for kind in every_kind():
-        for one in entries(kind):
-            if one.distribution not in {OWN, THIS_PROCESS}:
-                for place in _places(one.package):
-                    found.setdefault(place, one)
-    return found
+        for announced in entries(kind):
+            if announced.distribution not in {OWN, THIS_PROCESS}:
+                for place in _places(announced.package):
+                    by_place.setdefault(place, announced)
+    return by_place
 
 
 def _places(module: str) -> list[Path]:
