@@ -40,7 +40,8 @@ from .data.files import (
 )
 from .data.pairs import Dropped as Dropped, Pair as Pair, PairBatch as PairBatch, PairSet as PairSet
 from .data.pairs import Remark as Remark
-from .data.signals import COARSE_S as COARSE_S
+from .data.resampling import COARSE_S as COARSE_S
+from .data.signals import OBSERVED as OBSERVED, SIGNALS as SIGNALS, Signal as Signal
 from .data.sites import with_sites as with_sites
 from .data.style import (
     StyleResult as StyleResult,
@@ -136,13 +137,18 @@ from .policies.driver_step import (
 )
 from .policies.driver_step import FREE_ROAD_M as FREE_ROAD_M
 from .policies.features import (
-    History as History,
     Scaler as Scaler,
     Summary as Summary,
-    measured_history as measured_history,
 )
 from .policies.heads.base import DirectHead as DirectHead, ParameterHead as ParameterHead
 from .policies.heads.stochastic import NOISE_SCALE as NOISE_SCALE, StochasticHead as StochasticHead
+from .policies.history import History as History, measured_history as measured_history
+from .policies.inputs import require_no_further_signals as require_no_further_signals
+from .policies.inputs.base import PolicyInput as PolicyInput
+from .policies.known_drivers import (
+    base_of as base_of,
+    driver_features_of as driver_features_of,
+)
 from .policies.ready import READY_FOLDER as READY_FOLDER
 
 # Learners

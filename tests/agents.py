@@ -33,16 +33,19 @@ def adaptive(
     stochastic: bool = False,
     head: ParameterHead | None = None,
     driver_features: tuple[str, ...] = (),
+    further: tuple[str, ...] = (),
 ) -> Agent:
     """Returns a GRU for each name; what it chooses depends on all it sees.
 
     With `offsets` it answers offsets, from the middle between the bounds for who brings no base;
     with `residual` also how the residual acceleration decays, and with
-    `stochastic` how much it varies. `head` stands in for all of these.
+    `stochastic` how much it varies. `head` stands in for all of these. `further` are inputs that it
+    reads beside the usual ones.
     """
+    inputs = (*INPUTS, *further)
     model = registry.create("model", dict(node))
     assert isinstance(model, DrivingModel)
-    policy = GruPolicy(inputs=INPUTS, driver_features=driver_features, start="middle")
+    policy = GruPolicy(inputs=inputs, driver_features=driver_features, start="middle")
     networks = len(names)
     if head is None and stochastic:
         head = StochasticHead.for_model(model)
@@ -52,7 +55,7 @@ def adaptive(
         head = OffsetHead(model.space)
     elif head is None:
         head = DirectHead(model.space)
-    features = length * len(INPUTS) + head.width + len(driver_features)
+    features = length * len(inputs) + head.width + len(driver_features)
     unit = head.space.to_unit(head.space.defaults())
     network = (
         policy.build(features, unit, unit.expand(networks, -1), torch.Generator().manual_seed(3))
@@ -74,7 +77,7 @@ def adaptive(
         model_node=dict(node),
         policy_node={
             "name": "gru",
-            "inputs": list(INPUTS),
+            "inputs": list(inputs),
             "driver_features": list(driver_features),
             "start": "middle",
         },

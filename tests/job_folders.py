@@ -175,4 +175,4 @@ def _full_trajectory(values: pd.DataFrame) -> pd.DataFrame:
 
 
 def _statistics(before: pd.Series[float], after: pd.Series[float]) -> Improvement:
-    return improvement_statistics(before.to_numpy(), after.to_numpy(), seed=0)
+    return improvement_statistics(before.to_numpy(), after.to_numpy())

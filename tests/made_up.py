@@ -13,8 +13,8 @@ from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.data.style import CLUSTERS, StyleResult
 from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import Evaluation, PairTrajectory, Platoon
-from cfx.evaluation.statistics import Improvement
-from cfx.evaluation.tables import VALUE_COLUMNS
+from cfx.evaluation.statistics import improvement_statistics
+from cfx.evaluation.tables import VALUE_COLUMNS, values_of
 
 TWO = ParameterSpace.of(
     Parameter("t_r", "s", 0.1, 10.0, 1.5, "reaction time"),
@@ -61,10 +61,13 @@ def make_results(
         trajectories=trajectories,
         parameters=space.tuned,
     )
+    speed = values_of(values, "rmse_speed", "test")
+    drivers = [one.driver for one in trajectories]
     improvements = {}
     for baseline in methods:
-        if baseline != "policy":
-            improvements[baseline] = summarize(evaluation.table)
+        if baseline != "policy" and "policy" in methods:
+            errors = speed[baseline].to_numpy(), speed["policy"].to_numpy()
+            improvements[baseline] = improvement_statistics(*errors, drivers)
     evaluation = dataclasses.replace(evaluation, improvements={"test": improvements})
     style = make_style([one.driver for one in trajectories], rng)
     curves = make_curves(pairs if networks is None else networks, epochs, seed)
@@ -360,29 +363,6 @@ def make_style(drivers: list[str], rng: np.random.Generator) -> StyleResult:
     )
     return StyleResult(
         table, dict(zip(INDICATORS, rng.dirichlet(np.full(6, 4.0)), strict=True)), cuts
-    )
-
-
-def summarize(table: pd.DataFrame) -> Improvement:
-    """A plain stand-in for the evaluation's statistics."""
-    values = table.loc[table["method"] == "policy", "improvement"].to_numpy(dtype=float)
-    finite = np.sort(values[np.isfinite(values)])
-    undefined = len(values) - len(finite)
-    if not len(finite):
-        return Improvement(*[float("nan")] * 7, pairs=0, undefined=undefined, drivers=0)
-    cut, mean = len(finite) // 10, float(finite.mean())
-    half = 1.96 * float(finite.std()) / len(finite) ** 0.5
-    return Improvement(
-        mean=mean,
-        trimmed_mean=float(finite[cut : len(finite) - cut].mean()),
-        median=float(np.median(finite)),
-        ci95_low=mean - half,
-        ci95_high=mean + half,
-        win_rate=float((finite > 0).mean()),
-        p_value=0.03 if len(finite) > 1 else float("nan"),
-        pairs=len(finite),
-        undefined=undefined,
-        drivers=len(finite),
     )
 
 

@@ -89,7 +89,9 @@ def test_an_experiment_sweeps_without_being_told(
     for folder in summary["folder"]:
         job = tmp_path / "out" / folder
         assert yaml.safe_load((job / "config.yaml").read_text())["preset"] == "paper/clusters"
-        assert "rmse_improvement/population/mean" in json.loads((job / "metrics.json").read_text())
+        assert "rmse_improvement/population/geometric" in json.loads(
+            (job / "metrics.json").read_text()
+        )
 
 
 def test_one_pair_has_its_table_and_its_speed_plots(

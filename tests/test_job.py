@@ -22,6 +22,7 @@ from cfx.core import registry
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import write_tidy
 from cfx.errors import DataError
+from cfx.policies.prediction import predict_frame
 from cfx.simulation.synthetic import SyntheticDataset
 from tests.checkout import needs
 
@@ -97,9 +98,12 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.plugin.Result) ->
     expected |= {
         f"rmse_improvement/{name}"
         for name in (
-            "mean",
-            "trimmed_mean",
+            "geometric",
+            "ratio_of_means",
+            "mean_ratio",
+            "trimmed_mean_ratio",
             "median",
+            "drivers",
             "ci95_low",
             "ci95_high",
             "win_rate",
@@ -116,7 +120,8 @@ def test_the_terminal_says_what_matters(finished: cfx.plugin.Result) -> None:
         "driver-specific",
         "policy",
         "RMSE speed",
-        "95 % interval",
+        "policy better by %",
+        "In short: ",
         "Results:",
         "cfx ui",
         "http://127.0.0.1:5000",
@@ -200,7 +205,7 @@ def test_the_policy_in_mlflow_predicts_the_same(
         mlflow.set_tracking_uri(before)
         os.environ.pop("MLFLOW_TRACKING_URI", None)  # MLflow sets it too
     table = pd.read_parquet(finished.folder / "data.parquet")
-    pd.testing.assert_frame_equal(served.predict(table), finished.policy.predict_frame(table))
+    pd.testing.assert_frame_equal(served.predict(table), predict_frame(finished.policy, table))
     monkeypatch.chdir(home)
     again = cfx.load(tracked.info.run_id)
     assert again.metrics == finished.metrics
@@ -219,7 +224,7 @@ def test_other_components_run_too(overrides: list[str]) -> None:
     loaded = cfx.load(result.folder)
     table = pd.read_parquet(result.folder / "data.parquet")
     pd.testing.assert_frame_equal(
-        loaded.policy.predict_frame(table), result.policy.predict_frame(table)
+        predict_frame(loaded.policy, table), predict_frame(result.policy, table)
     )
 
 

@@ -19,7 +19,7 @@ from cfx.core import memory
 from cfx.data import style, tidy
 from cfx.data.base import joined
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.signals import resampled, scaled
+from cfx.data.resampling import resampled, scaled
 from cfx.data.tidy import read_tidy, write_tidy
 from cfx.errors import OutputError
 from cfx.evaluation import closed_loop, evaluate, result

@@ -53,7 +53,7 @@ JOB = """
             time.sleep(0.02)
         metrics = {f"rmse_speed/{method}": value + config.seed for method, value in
                    (("default", 1.0), ("fixed", 0.5), ("policy", 0.25))}
-        metrics |= {"rmse_improvement/mean": 0.5, "rmse_improvement/ci95_low": 0.25,
+        metrics |= {"rmse_improvement/geometric": 0.5, "rmse_improvement/ci95_low": 0.25,
                     "rmse_improvement/ci95_high": None}
         if config.model["name"] == "w99":
             for name in ("mean", "ci95_low", "ci95_high"):
@@ -331,7 +331,7 @@ def test_the_summary_compares_jobs_by_what_differs(run: Run, capsys) -> None:
     ]
     assert "split" not in table[0]
     assert [row["improvement_over"] for row in table] == ["fixed", "fixed", "", ""]
-    assert [row["improvement_mean"] for row in table] == ["0.5", "0.5", "", ""]
+    assert [row["improvement_geometric"] for row in table] == ["0.5", "0.5", "", ""]
     assert [row["improvement_ci95_high"] for row in table] == ["", "", "", ""]
     assert [row["rmse_speed_policy"] for row in table] == ["0.25", "0.25", "", ""]
     assert table[2]["message"] == "drive 2 is broken"

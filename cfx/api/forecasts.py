@@ -16,6 +16,7 @@ from cfx.api.experiment import PolicyLike, config, in_folder, settings_of
 from cfx.api.pairs import PairIds, PairsLike, chosen_names, pairs_from
 from cfx.core.guest import visit
 from cfx.errors import ConfigError
+from cfx.policies.known_drivers import base_of
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -131,7 +132,7 @@ def forecast(
         finished = cast(Any, parts.protocol).finished
         finished.check(context.pairs)
         agent: Agent = finished.agent.to(context.batch.lengths.device)
-        if samples and not agent.is_stochastic:
+        if samples and not agent.core.head.is_stochastic:
             raise ConfigError(
                 f"samples={samples}: this policy leaves nothing to chance; give samples=0, or train"
                 " a stochastic one: cfx.train(pairs, for_='stochastic')"
@@ -148,7 +149,7 @@ def forecast(
         base = None  # what the agent brings
         if agent.base is not None and agent.context_rule.driver_specific:
             calibrated = context.calibrator.fixed(context.pairs, context.batch, origins.frame.cpu())
-            base = agent.base_of(calibrated)[:, : calibrated.shape[1]]
+            base = base_of(agent, calibrated)[:, : calibrated.shape[1]]
         network = torch.zeros_like(origins.pair)
         followers = Followers(context.batch, network, base, agent.context_rule.history_s)
         found = sample_from_origins(

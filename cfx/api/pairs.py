@@ -69,7 +69,8 @@ class FrameDataset(TidyDataset):
         self._frame = frame
 
     def read(self) -> PairSet:
-        return pairs_from_frame(self._frame, "the table", self.settings.own_layout())
+        layout, signals = self.settings.own_layout(), self.settings.further_signals()
+        return pairs_from_frame(self._frame, "the table", layout, signals)
 
 
 @dataclass(frozen=True, repr=False)
@@ -151,6 +152,7 @@ class Pairs:
             # Checked as they were recorded: averages in place of noisy accelerations lag behind
             # speeds and would be refused.
             "data.check": "off",
+            "data.inputs": self.node.get("inputs", []),
         }
         return Pairs.of(config_of(settings).data)
 

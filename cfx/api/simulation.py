@@ -21,7 +21,7 @@ from cfx.core.guest import visit
 from cfx.data.names import named_twice, names_of
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.data.table import FileColumn, Layout, table_of
-from cfx.data.tracks import accelerations, driven
+from cfx.data.tracks import accelerations, distance_driven
 from cfx.errors import ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -190,7 +190,7 @@ def _behind(
                 first_frame=0,
                 dt=dt,
                 leader_length=0.0,
-                leader_position=ahead + driven(speeds, dt),
+                leader_position=ahead + distance_driven(speeds, dt),
                 leader_speed=speeds,
                 leader_acceleration=accelerations(speeds, dt),
                 follower_position=still,

@@ -108,17 +108,20 @@ def _command(name: str, *arguments: str) -> int:
 
 def _hydra(arguments: Sequence[str]) -> int:
     """Runs the Hydra application; completes what a shell asks for (`-sc query=bash`)."""
-    from cfx.app import completion
-
-    def start() -> int:
-        from cfx.app import application
-
-        return application.start(arguments)
-
     asks = len(arguments) == 2 and arguments[0] in {"-sc", "--shell-completion"}
     if asks and arguments[1].startswith("query="):
-        return completion.answer(start)
-    return start()
+        from cfx.app import completion
+
+        return completion.answer(lambda: _started(arguments))
+    return _started(arguments)
+
+
+def _started(arguments: Sequence[str]) -> int:
+    """Starts the Hydra application, which knows no `--verbose`: it is a setting there."""
+    from cfx.app import application
+
+    settings = ["output.verbose=true" if word == "--verbose" else word for word in arguments]
+    return application.start(settings)
 
 
 def program() -> NoReturn:

@@ -76,7 +76,7 @@ class Kind:
         first: module and name of the statements that a new component is held to; base classes of
             the other kinds check what a component gives.
         chosen: a job chooses one of this kind, by a config group; metrics are all measured, tables
-            are all written, and sub-commands are none of a job.
+            are all written, a policy has several inputs, and sub-commands are none of a job.
     """
 
     name: str
@@ -101,6 +101,8 @@ class Kind:
             return f"cfx {component}"
         if self.name == "export":
             return f"cfx export JOB --to {component}"
+        if self.name == "input":
+            return f"policy.inputs=[{component}]"
         return f"{self.group}={component}"
 
 
@@ -125,6 +127,7 @@ KINDS: dict[str, Kind] = {
             "cfx.calibration.objectives:Objective",
             first="cfx.calibration.contract:FIRST_OF_OBJECTIVES",
         ),
+        Kind("input", "cfx.policies.inputs.base:PolicyInput", group="policy.inputs", chosen=False),
         Kind("engine", "cfx.core.engine:Engine"),
         Kind("learner", "cfx.learners.base:Learner"),
         Kind("protocol", "cfx.evaluation.protocols.base:Protocol"),

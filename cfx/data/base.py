@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from abc import abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -18,13 +19,15 @@ from cfx.core import memory, registry
 from cfx.core.component import Component, Distinct, Settings
 from cfx.core.files import absolute
 from cfx.core.storage import is_url, local_copies
+from cfx.data.accelerations import Accelerations, with_usable_accelerations
 from cfx.data.check import Check, check_pairs
 from cfx.data.files import FileStart, recording_of, stem
 from cfx.data.names import Name
-from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet, Remark
-from cfx.data.signals import Accelerations, resampled, scaled, with_usable_accelerations
+from cfx.data.pairs import Dropped, Pair, PairSet, Remark, driver_names, of_each
+from cfx.data.resampling import resampled, scaled
+from cfx.data.signals import RECORDED
 from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
-from cfx.data.tracks import summed
+from cfx.data.tracks import totals_by_reason
 from cfx.errors import DataError, PluginError, listed, nearest
 
 log = logging.getLogger(__name__)
@@ -33,18 +36,25 @@ log = logging.getLogger(__name__)
 def _files(value: Any) -> Path | str | tuple[Path | str, ...]:
     """Returns one path, or several, as absolute ones; URLs as they are."""
     several = isinstance(value, list | tuple)
-    written = value if several else [value]
+    written = [value]
+    if several:
+        written = value
     if not written:
         raise PydanticCustomError("path", "the list is empty; write at least one file")
-    for one in written:
-        if not isinstance(one, str | Path | None):
+    paths: list[Any] = []
+    for path in written:
+        if not isinstance(path, str | Path | None):
             raise PydanticCustomError(
                 "path", "write a file, a list of files, or a pattern such as 'i-80/*.txt'"
             )
-    paths = tuple(one if is_url(one) else absolute(one) for one in written)
+        if is_url(path):
+            paths.append(path)
+        else:
+            paths.append(absolute(path))
     if several:
-        return paths
-    return paths[0]
+        return tuple(paths)
+    only: Path | str = paths[0]
+    return only
 
 
 FilePaths = Annotated[Path | str | tuple[Path | str, ...], BeforeValidator(_files)]
@@ -149,20 +159,23 @@ class FileDatasetSettings(DatasetSettings):
         return files
 
 
+_PATTERN = re.compile(r"[*?\[]")
+"""What makes a path a pattern of file names."""
+
+
 def _matching(path: Path | str) -> list[Path]:
     """Returns the files that a path, a URL or a pattern stands for, sorted by name."""
     if isinstance(path, str):
         return local_copies(path)
-    is_pattern = any(mark in str(path) for mark in "*?[")
-    if path.exists() or not is_pattern:
+    if path.exists() or not _PATTERN.search(str(path)):
         return [path]
-    found = []
+    files = []
     for file in Path(path.anchor).glob(str(path.relative_to(path.anchor))):
         if file.is_file():
-            found.append(file)
-    if not found:
+            files.append(file)
+    if not files:
         raise DataError(f"data.path={path}: no file matches this pattern")
-    return sorted(found)
+    return sorted(files)
 
 
 class Contents(NamedTuple):
@@ -211,12 +224,11 @@ class Dataset(Component):
             DataError: as `read`.
         """
         pairs = self.read()
-        rows = sum(len(pair) for pair in pairs)
         vehicles = set()
         for pair in pairs:
             vehicles.add((pair.recording, pair.leader_id))
             vehicles.add((pair.recording, pair.follower_id))
-        return Contents(pairs, rows, len(vehicles))
+        return Contents(pairs, pairs.frames, len(vehicles))
 
     def units(self) -> Mapping[str, str]:
         """Returns the units that the source is said to have in place of SI units.
@@ -248,8 +260,12 @@ class Dataset(Component):
         memory.give_back()
         self._check(pairs)
         if not len(pairs):
-            reasons = [f"{one.count:,} {one.unit}: {one.reason}" for one in pairs.dropped]
-            why = f" (left out: {'; '.join(reasons)})" if reasons else ""
+            reasons = []
+            for dropped in pairs.dropped:
+                reasons.append(f"{dropped.count:,} {dropped.unit}: {dropped.reason}")
+            why = ""
+            if reasons:
+                why = f" (left out: {'; '.join(reasons)})"
             raise DataError(f"{pairs.source}: no leader-follower pair found{why}")
         pairs = with_sites(pairs, self.settings.site)
         pairs = with_vehicles(pairs, self.settings.vehicle)
@@ -264,9 +280,9 @@ class Dataset(Component):
                     " two such steps; give a shorter one"
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_duration), self.settings)
-        used = tuple(recorded[pair.pair_id] for pair in selected.pairs)
+        as_recorded = tuple([recorded[pair.pair_id] for pair in selected.pairs])
         verdict = check_pairs(
-            replace(selected, pairs=used),
+            replace(selected, pairs=as_recorded),
             self.settings.check,
             self.units(),
             can_say_units=hasattr(self.settings, "units"),
@@ -286,11 +302,17 @@ class Dataset(Component):
                 f" but returned a {type(pairs).__name__}"
             )
         for pair in pairs:
-            for name in SIGNALS:
+            for name in RECORDED:
                 if not bool(np.isfinite(getattr(pair, name)).all()):
                     raise PluginError(
                         f"{registry.origin(self)}: pair {pair.pair_id} has a {name} that is not"
                         " finite; a dataset splits or leaves out what has gaps"
+                    )
+            for signal, values in pair.surroundings.items():
+                if not bool(np.isfinite(values).all()):
+                    raise PluginError(
+                        f"{registry.origin(self)}: pair {pair.pair_id} has a {signal.name} that is"
+                        " not finite; a dataset splits or leaves out what has gaps"
                     )
 
 
@@ -312,7 +334,8 @@ def joined(files: Iterable[PairSet]) -> PairSet:
     parts = _compact(files)
     if len(parts) == 1:
         return parts[0]
-    parts = [_at_site(part) for part in parts]
+    for number, part in enumerate(parts):
+        parts[number] = _at_site(part)
     _require_different(parts)
     pairs: list[Pair] = []
     dropped: list[Dropped] = []
@@ -328,8 +351,8 @@ def joined(files: Iterable[PairSet]) -> PairSet:
     return PairSet(
         tuple(pairs),
         f"{len(parts)} files ({sources})",
-        summed(dropped),
-        summed(ends),
+        totals_by_reason(dropped),
+        totals_by_reason(ends),
         tuple(remarks),
     )
 
@@ -337,10 +360,15 @@ def joined(files: Iterable[PairSet]) -> PairSet:
 def _at_site(part: PairSet) -> PairSet:
     """Returns the pairs of a file; its name stands in for a site that is not known."""
     file = Path(part.source)
-    if recording_of(file) is not None or all(pair.site for pair in part.pairs):
+    if recording_of(file) is not None:
         return part
-    named = tuple(replace(pair, site=pair.site or stem(file)) for pair in part.pairs)
-    return replace(part, pairs=named)
+    pairs = []
+    for pair in part.pairs:
+        if pair.site:
+            pairs.append(pair)
+        else:
+            pairs.append(replace(pair, site=stem(file)))
+    return replace(part, pairs=tuple(pairs))
 
 
 def _compact(files: Iterable[PairSet]) -> list[PairSet]:
@@ -367,7 +395,9 @@ def _require_different(parts: Sequence[PairSet]) -> None:
             for key in (pair.pair_id, pair.content):
                 if key in seen:
                     source, name = seen[key]
-                    there = "" if name == pair.pair_id else f", there '{pair.pair_id}',"
+                    there = ""
+                    if name != pair.pair_id:
+                        there = f", there '{pair.pair_id}',"
                     raise DataError(
                         f"{source} and {part.source}: pair '{name}'{there} stands in both files;"
                         " leave it out of one of them"
@@ -386,47 +416,60 @@ _NOUNS = {
 """What the settings that select pairs by a value name."""
 
 
-def _selected(pairs: PairSet, name: str, wanted: Any) -> PairSet:
-    """Keeps the pairs that a setting names; all where it is None."""
-    if wanted is None:
+def _selected(pairs: PairSet, name: str, setting: Any) -> PairSet:
+    """Keeps the pairs that a setting names, one value or a list of them; all where it is None."""
+    if setting is None:
         return pairs
     attribute = {"lanes": "lane", "pair_ids": "pair_id"}.get(name, name)
-    values = [getattr(pair, attribute) for pair in pairs]
-    known = [value for value in dict.fromkeys(values) if value not in {None, ""}]
-    if not known:
-        unsaid = "in which lane its pairs are" if name == "lanes" else "what drives its vehicles"
+    values = of_each(pairs, attribute)
+    recorded = list(dict.fromkeys(values))
+    for blank in (None, ""):
+        if blank in recorded:
+            recorded.remove(blank)
+    if not recorded:
+        unsaid = "what drives its vehicles"
+        if name == "lanes":
+            unsaid = "in which lane its pairs are"
         raise DataError(
-            f"data.{name}={wanted}: {pairs.source} does not say {unsaid}; leave data.{name} out"
+            f"data.{name}={setting}: {pairs.source} does not say {unsaid}; leave data.{name} out"
         )
-    several = isinstance(wanted, list)
-    asked = wanted if several else [wanted]
-    what = "" if asked else "the list is empty."
-    for one in asked:
-        if one not in known:
-            near = nearest(str(one), [str(value) for value in known])
-            what = f"there is no {_NOUNS[name]} '{one}'.{near}"
-            break
-    if what:
-        raise DataError(f"data.{name}={wanted}: {pairs.source}: {what} Known: {listed(known)}.")
-    others = f"other {name} than {listed(asked)}" if several else f"another {name} than '{wanted}'"
+    chosen = [setting]
+    others = f"another {name} than '{setting}'"
+    if isinstance(setting, list):
+        chosen = setting
+        others = f"other {name} than {listed(chosen)}"
     if name == "pair_ids":
         others = "other pairs than data.pair_ids"
-    return pairs.select([value in asked for value in values], others)
+    mistake = ""
+    if not chosen:
+        mistake = "the list is empty."
+    for value in chosen:
+        if value not in recorded:
+            near = nearest(str(value), [str(other) for other in recorded])
+            mistake = f"there is no {_NOUNS[name]} '{value}'.{near}"
+            break
+    if mistake:
+        raise DataError(
+            f"data.{name}={setting}: {pairs.source}: {mistake} Known: {listed(recorded)}."
+        )
+    return pairs.select([value in chosen for value in values], others)
 
 
 def _select_long(pairs: PairSet, min_duration: float) -> PairSet:
     """Keeps the pairs that last at least so many seconds, and warns of the others."""
-    kept = [pair.lasts(min_duration) for pair in pairs]
+    kept, durations = [], []
+    for pair in pairs:
+        kept.append(pair.lasts(min_duration))
+        durations.append(pair.duration)
     long = pairs.select(kept, f"shorter than {min_duration:g} s")
     if not len(long):
-        longest = max(pair.duration for pair in pairs)
+        longest = max(durations)
         raise DataError(
             f"{pairs.source}: none of its {len(pairs)} pairs lasts {min_duration:g} s, the longest"
             f" lasts {longest:.6g} s; lower data.min_duration"
         )
     short = len(pairs) - len(long)
     if short:
-        shortest = min(pair.duration for pair in pairs)
         log.warning(
             "%s: %d of %d pairs are left out, which last less than data.min_duration=%g s;"
             " data.min_duration=%g keeps all",
@@ -434,7 +477,7 @@ def _select_long(pairs: PairSet, min_duration: float) -> PairSet:
             short,
             len(pairs),
             min_duration,
-            rounded_down(shortest),
+            rounded_down(min(durations)),
         )
     return long
 
@@ -445,24 +488,24 @@ def rounded_down(duration: float) -> float:
 
 
 def _select_first(pairs: PairSet, settings: DatasetSettings) -> PairSet:
-    wanted = settings.max_pairs
-    if wanted is None or len(pairs) == wanted:
+    count = settings.max_pairs
+    if count is None or len(pairs) == count:
         return pairs
-    if len(pairs) < wanted:
+    if len(pairs) < count:
         where = ""
         if settings.recording or settings.lanes:
             where = " in the selected recording and lanes"
         raise DataError(
-            f"{pairs.source}: asked for {wanted} pairs but only {len(pairs)} last"
+            f"{pairs.source}: asked for {count} pairs but only {len(pairs)} last"
             f" {settings.min_duration:g} s{where}; lower data.max_pairs or data.min_duration"
         )
-    beyond = Dropped(f"beyond max_pairs ({wanted})", len(pairs) - wanted)
-    return replace(pairs, pairs=pairs.pairs[:wanted], dropped=(*pairs.dropped, beyond))
+    beyond = Dropped(f"beyond max_pairs ({count})", len(pairs) - count)
+    return replace(pairs, pairs=pairs.pairs[:count], dropped=(*pairs.dropped, beyond))
 
 
 def load_pairs(dataset: Dataset) -> PairSet:
     """Returns all pairs of a dataset, and says what they are."""
     pairs = dataset.load()
-    drivers = len({pair.driver for pair in pairs})
+    drivers = len(driver_names(pairs))
     log.info("%d pairs of %d drivers from %s", len(pairs), drivers, pairs.source)
     return pairs

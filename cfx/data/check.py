@@ -72,15 +72,19 @@ def judge(pairs: PairSet, check: Check, units: Units | None = None) -> Verdict:
         return Verdict("")
     broken = list(contradictions(pairs, units))
     names = tuple(name for name, _ in broken)
-    sentences = [remark.text for remark in pairs.remarks if remark.is_contradiction]
+    sentences = []
+    for remark in pairs.remarks:
+        if remark.is_contradiction:
+            sentences.append(remark.text)
     is_common = bool(sentences)
     if broken:
         sentences.append(_of_pairs(pairs, broken, units))
     can_leave_out = check == "drop" or (check == "drop_few" and _FEW * len(names) < len(pairs))
+    typical = None
     if can_leave_out and not is_common:
         typical = typical_contradiction(_without(pairs, names))
-    else:
-        typical = None if broken else typical_contradiction(pairs)
+    elif not broken:
+        typical = typical_contradiction(pairs)
     if typical is not None:
         is_common = True
         sentences.append(
@@ -136,7 +140,11 @@ def check_pairs(
 def _without(pairs: PairSet, names: Sequence[str]) -> PairSet:
     """Returns the pairs that are not named."""
     left_out = frozenset(names)
-    return pairs.take([at for at, pair in enumerate(pairs.pairs) if pair.pair_id not in left_out])
+    kept = []
+    for number, pair in enumerate(pairs.pairs):
+        if pair.pair_id not in left_out:
+            kept.append(number)
+    return pairs.take(kept)
 
 
 def _of_pairs(
@@ -146,16 +154,19 @@ def _of_pairs(
     count = f"{len(broken)} of {len(pairs)} pairs contradict themselves"
     if len(broken) == 1:
         count = f"one of {len(pairs)} pairs contradicts itself"
-    alike: dict[str, list[tuple[str, Contradiction]]] = {}
-    for name, how in broken:
-        alike.setdefault(_NUMBERS.sub("", how.text(units)), []).append((name, how))
+    # Sentences that differ in their numbers alone are one.
+    by_sentence: dict[str, list[tuple[str, Contradiction]]] = {}
+    for name, contradiction in broken:
+        sentence = _NUMBERS.sub("", contradiction.text(units))
+        by_sentence.setdefault(sentence, []).append((name, contradiction))
     parts = []
-    for group in sorted(alike.values(), key=len, reverse=True)[:_SHOWN]:
-        names = listed([f"'{name}'" for name, _ in group], _SHOWN)
-        parts.append(f"{_common([how for _, how in group]).text(units)} (pairs: {names})")
+    for alike in sorted(by_sentence.values(), key=len, reverse=True)[:_SHOWN]:
+        names = listed([f"'{name}'" for name, _ in alike], _SHOWN)
+        typical = sorted(alike, key=_slope)[len(alike) // 2][1]
+        parts.append(f"{typical.text(units)} (pairs: {names})")
     return f"{count}: {'; '.join(parts)}"
 
 
-def _common(alike: Sequence[Contradiction]) -> Contradiction:
-    """Returns the contradiction of the median slope, which stands for those of several pairs."""
-    return sorted(alike, key=lambda one: one.slope or 0.0)[len(alike) // 2]
+def _slope(broken: tuple[str, Contradiction]) -> float:
+    """Returns the slope of a pair's contradiction, by which the median one is typical."""
+    return broken[1].slope or 0.0

@@ -20,10 +20,10 @@ from cfx.core.files import path_override
 from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset, rounded_down
 from cfx.data.check import Check, judge
-from cfx.data.files import Floats, beginning, partitions
-from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.files import Floats, Ints, beginning, has_letters, partitions
+from cfx.data.pairs import Dropped, Pair, PairSet, driver_names, of_each, over_frames
 from cfx.data.plausible import doubts, rare
-from cfx.data.signals import frames_in_steps
+from cfx.data.resampling import frames_in_steps
 from cfx.data.style import (
     ALL_TYPES,
     INDICATORS,
@@ -109,14 +109,21 @@ def describe(
     if len(contents.pairs):
         pieces += ["", _motion(contents.pairs)]
     left_out = _counts(contents.pairs.dropped)
-    pieces += ["", f"Left out in reading:{'' if left_out else ' nothing'}", *left_out]
+    heading = "Left out in reading:"
+    if not left_out:
+        heading += " nothing"
+    pieces += ["", heading, *left_out]
     if contents.pairs.ends:
         pieces += ["", "Why pairs end:", *_counts(contents.pairs.ends)]
     problems = [*_suspicions(contents, dataset.settings.check, dataset.units())]
     if contents.problem:
         problems.append(contents.problem)
-    pieces += ["", f"Problems:{'' if problems else ' none found'}"]
-    pieces += [f"  {sentence}" for sentence in problems]
+    heading = "Problems:"
+    if not problems:
+        heading += " none found"
+    pieces += ["", heading]
+    for sentence in problems:
+        pieces.append(f"  {sentence}")
     more, kept = _advice(_lengths(contents.pairs), dataset.settings.min_duration)
     pieces += ["", reader.use(path) + more, *kept]
     return Description(_text(pieces), contents.pairs)
@@ -131,25 +138,29 @@ def describe_sites(pairs: PairSet) -> str:
     of_site: dict[str, list[Pair]] = {}
     for pair in pairs:
         of_site.setdefault(pair.site or pair.recording, []).append(pair)
-    for site, some in of_site.items():
-        table.add_row(site, *_site_cells(some))
-        kinds = dict.fromkeys(pair.driver_type for pair in some)
-        for kind in kinds if len(kinds) > 1 else ():
-            mine = [pair for pair in some if pair.driver_type == kind]
-            table.add_row(f"  {kind or NOT_KNOWN}", *_site_cells(mine))
+    for site, pairs_there in of_site.items():
+        table.add_row(site, *_site_cells(pairs_there))
+        of_type: dict[str, list[Pair]] = {}
+        for pair in pairs_there:
+            of_type.setdefault(pair.driver_type, []).append(pair)
+        if len(of_type) > 1:
+            for driver_type, pairs_of_type in of_type.items():
+                table.add_row(f"  {driver_type or NOT_KNOWN}", *_site_cells(pairs_of_type))
     return _text([table], _WIDE)
 
 
 def _site_cells(pairs: Sequence[Pair]) -> Iterator[str]:
     """Yields the cells of some pairs' row: counts, then how they drive."""
+    seconds = 0.0
+    for pair in pairs:
+        seconds += pair.duration
     yield f"{len(pairs):,}"
-    yield f"{len({pair.driver for pair in pairs}):,}"
-    yield f"{sum(len(pair) * pair.dt for pair in pairs) / 60:,.0f}"
-    speed = np.concatenate([pair.follower_speed for pair in pairs])
-    headway = np.concatenate([pair.leader_position - pair.follower_position for pair in pairs])
+    yield f"{len(driver_names(pairs)):,}"
+    yield f"{seconds / 60:,.0f}"
+    speed = over_frames(pairs, "follower_speed")
+    headway = over_frames(pairs, "leader_position") - over_frames(pairs, "follower_position")
     moving = speed >= STANDING_MPS
-    gap = np.concatenate([pair.gap for pair in pairs])
-    for values in (speed, headway[moving] / speed[moving], gap):
+    for values in (speed, headway[moving] / speed[moving], over_frames(pairs, "gap")):
         if not len(values):
             yield "-"
             continue
@@ -168,38 +179,48 @@ def describe_style(style: StyleResult, distances: pd.DataFrame | None) -> str:
     if sites is None:
         return "Driving style: there is one site alone; give the files of several"
     headings = ["site", "drivers", "score", "95 %"]
-    for one in INDICATORS:
-        words = name_of_indicator(one.name).replace(" ", "\n")
-        headings.append(f"{words}\n{one.unit}")
+    weights = []
+    for indicator in INDICATORS:
+        words = name_of_indicator(indicator.name).replace(" ", "\n")
+        headings.append(f"{words}\n{indicator.unit}")
+        weights.append(f"{style.weights[indicator.name]:.2f}")
     title = "Driving style, 0 conservative to 1 aggressive: medians over drivers"
     table = _table(*headings, title=title, right=1, left=0)
     for column in table.columns:
         column.no_wrap = True
-    weights = [f"{style.weights[one.name]:.2f}" for one in INDICATORS]
     table.add_row("entropy weight", "", "", "", *weights)
     for row in sites.to_dict("records"):
-        is_whole = row["driver_type"] == ALL_TYPES
-        interval = "-"
+        interval, name = "-", str(row["site"])
+        if row["driver_type"] != ALL_TYPES:
+            name = f"  {row['driver_type']}"
         if np.isfinite(row["score_low"]):
             interval = f"{row['score_low']:.3f} to {row['score_high']:.3f}"
-        values = [f"{row[one.name]:.2f}" for one in INDICATORS]
-        name = row["site"] if is_whole else f"  {row['driver_type']}"
+        medians = []
+        for indicator in INDICATORS:
+            medians.append(f"{row[indicator.name]:.2f}")
         score = f"{row['score_median']:.3f}"
-        table.add_row(str(name), str(row["drivers"]), score, interval, *values)
+        table.add_row(name, str(row["drivers"]), score, interval, *medians)
     pieces: list[RenderableType] = [table]
     if distances is not None:
-        title = "How far apart: energy distance of the scores"
-        apart = _table("", "", "distance", "p", "differ most in", title=title, right=1, left=1)
-        apart.columns[1].justify = apart.columns[4].justify = "left"
-        for row in distances.to_dict("records"):
-            ends = []
-            for whose in ("", "other_"):
-                site, kind = row[f"{whose}site"], row[f"{whose}driver_type"]
-                ends.append(str(site) if kind == ALL_TYPES else f"{site}, {kind}")
-            most = name_of_indicator(str(row["most"]))
-            apart.add_row(*ends, f"{row['distance']:.3f}", f"{row['p_value']:.3f}", most)
-        pieces += ["", apart]
+        pieces += ["", _distance_table(distances)]
     return _text(pieces, _WIDE)
+
+
+def _distance_table(distances: pd.DataFrame) -> Table:
+    """Returns how far the styles of any two sites are apart, a row for each two."""
+    title = "How far apart: energy distance of the scores"
+    table = _table("", "", "distance", "p", "differ most in", title=title, right=1, left=1)
+    table.columns[1].justify = table.columns[4].justify = "left"
+    for row in distances.to_dict("records"):
+        ends = []
+        for whose in ("", "other_"):
+            site, driver_type = str(row[f"{whose}site"]), row[f"{whose}driver_type"]
+            if driver_type != ALL_TYPES:
+                site = f"{site}, {driver_type}"
+            ends.append(site)
+        most = name_of_indicator(str(row["most"]))
+        table.add_row(*ends, f"{row['distance']:.3f}", f"{row['p_value']:.3f}", most)
+    return table
 
 
 def _table(*headings: str, title: str | None = None, right: int = 2, left: int = 2) -> Table:
@@ -239,7 +260,7 @@ def _describe_partitions(folder: Path, reader: _Reader) -> str:
     long_s = _THRESHOLDS_S[-1]
     headings = ("recordings", "rows", "pairs", "drivers", "frames", f"of at least {long_s} s")
     table = _table("file", *headings)
-    totals = [0] * 5
+    totals = np.zeros(5, np.int64)
     names: set[str] = set()
     lengths: list[tuple[int, float]] = []
     files = partitions(folder)
@@ -247,22 +268,30 @@ def _describe_partitions(folder: Path, reader: _Reader) -> str:
         dataset = reader.of(file)
         contents = dataset.contents()
         pairs = contents.pairs
-        recordings = {pair.recording for pair in pairs}
-        drivers = {pair.driver for pair in pairs}
-        long = sum(pair.lasts(long_s) for pair in pairs)
-        counts = [contents.rows, len(pairs), len(drivers), _frames(pairs), long]
-        totals = [before + count for before, count in zip(totals, counts, strict=True)]
+        recordings: set[str] = set()
+        long = 0
+        for pair in pairs:
+            recordings.add(pair.recording)
+            long += pair.lasts(long_s)
+        drivers = len(driver_names(pairs))
+        counts = np.array([contents.rows, len(pairs), drivers, pairs.frames, long])
+        totals += counts
         names |= recordings
         lengths += _lengths(pairs)
-        cells = [f"{count:,}" for count in counts]
+        cells = _grouped_digits(counts)
         table.add_row(str(file.relative_to(folder)), listed(sorted(recordings), 2), *cells)
-    table.add_row("all", f"{len(names):,}", *[f"{count:,}" for count in totals])
+    table.add_row("all", f"{len(names):,}", *_grouped_digits(totals))
     more, kept = _advice(lengths, dataset.settings.min_duration)
     layout = f"{dataset.layout}, {len(files)} files, read one after the other"
-    alone = "A recording alone: python -m cfx data describe FILE"
-    one = "One recording of it: data.recording=NAME"
+    one_file = "A recording alone: python -m cfx data describe FILE"
+    one_recording = "One recording of it: data.recording=NAME"
     use = reader.use(folder) + more
-    return _text([str(folder), "", layout, "", table, "", alone, use, *kept, one])
+    return _text([str(folder), "", layout, "", table, "", one_file, use, *kept, one_recording])
+
+
+def _grouped_digits(counts: Ints) -> list[str]:
+    """Returns numbers as people write them: 12,345."""
+    return [f"{count:,}" for count in counts.tolist()]
 
 
 def _text(pieces: Sequence[RenderableType], width: int = _WIDTH) -> str:
@@ -282,16 +311,17 @@ def dataset_of(path: Path) -> str:
     """
     start = beginning(path)
     layouts = []
-    found = sorted(registry.entries("dataset"), key=lambda one: one.distribution != OWN)
-    for one in found:
-        cls = _usable(one)
+    # Sorting is stable: cfx's own come first, each group by name.
+    entries = sorted(registry.entries("dataset"), key=lambda entry: entry.distribution != OWN)
+    for entry in entries:
+        cls = _usable(entry)
         if cls is None:
             continue
         if cls.recognises(start):
-            return one.name
+            return entry.name
         if cls.layout:
-            layouts.append(f"{cls.layout} (data={one.name})")
-    has_names = any(character.isalpha() for character in "".join(start.columns))
+            layouts.append(f"{cls.layout} (data={entry.name})")
+    has_names = has_letters("".join(start.columns))
     if start.path.is_dir() or has_names:
         columns = listed(start.columns, 20) or "none: it is a folder"
         raise DataError(
@@ -302,19 +332,15 @@ def dataset_of(path: Path) -> str:
     return "ngsim"  # whose reader says what is wrong with a file without column names
 
 
-def _usable(found: Entry) -> type[Dataset] | None:
+def _usable(entry: Entry) -> type[Dataset] | None:
     """Returns a dataset's class; None, and a warning, for a plugin that is broken."""
-    if registry.rivals(found):
+    if registry.rivals(entry):
         return None
     try:
-        return cast(type[Dataset], registry.get("dataset", found.name))
+        return cast(type[Dataset], registry.get("dataset", entry.name))
     except PluginError as error:
         log.warning("%s", error)
         return None
-
-
-def _frames(pairs: PairSet) -> int:
-    return sum(len(pair) for pair in pairs)
 
 
 def _lengths(pairs: PairSet) -> list[tuple[int, float]]:
@@ -332,56 +358,75 @@ def _advice(pairs: Sequence[tuple[int, float]], usual: float) -> tuple[str, list
     if not pairs:
         return "", []
     options = ""
-    steps = {dt for _, dt in pairs}
-    step = max(steps)
-    if len(steps) > 1:
+    recorded_steps = {dt for _, dt in pairs}
+    step = max(recorded_steps)
+    if len(recorded_steps) > 1:
         options = f" data.time_step={step:g}"
-    durations = sorted(frames_in_steps(frames, dt, step) * step for frames, dt in pairs)
-    median = durations[(len(durations) - 1) // 2]
+    in_steps = [frames_in_steps(frames, dt, step) for frames, dt in pairs]
+    durations = np.sort(np.array(in_steps) * step)
+    median = float(durations[(len(durations) - 1) // 2])
     least = usual
-    if sum(duration >= usual - _ROUNDING_S for duration in durations) * 2 < len(durations):
+    if np.count_nonzero(durations >= usual - _ROUNDING_S) * 2 < len(durations):
         least = rounded_down(median)
         if least > _ROUND_S:
             least = least // _ROUND_S * _ROUND_S
         options += f" data.min_duration={least:g}"
-    kept = sum(duration >= least - _ROUNDING_S for duration in durations)
+    kept = np.count_nonzero(durations >= least - _ROUNDING_S)
     if kept == len(durations):
         return options, [f"It keeps all {kept:,} pairs."]
+    shortest = rounded_down(float(durations[0]))
     return options, [
         f"It keeps {kept:,} of {len(durations):,} pairs and leaves out {len(durations) - kept:,}"
-        f" shorter than {least:g} s; data.min_duration={rounded_down(durations[0]):g} keeps all."
+        f" shorter than {least:g} s; data.min_duration={shortest:g} keeps all."
     ]
 
 
 def _overview(layout: str, contents: Contents) -> Table:
     """Returns what a file holds, a row per question."""
     pairs = contents.pairs
-    recordings = Counter(pair.recording for pair in pairs)
-    counted = [f"{name} ({count} pairs)" for name, count in recordings.items()]
-    drivers = {pair.driver for pair in pairs}
-    lanes = sorted({pair.lane for pair in pairs if pair.lane is not None})
-    steps = sorted({pair.dt for pair in pairs})
-    truth = {pair.truth_model for pair in pairs if pair.truth}
+    recordings: Counter[str] = Counter()
+    lanes: set[int] = set()
+    steps: set[float] = set()
+    truth: set[str] = set()
+    for pair in pairs:
+        recordings[pair.recording] += 1
+        steps.add(pair.dt)
+        if pair.lane is not None:
+            lanes.add(pair.lane)
+        if pair.truth:
+            truth.add(pair.truth_model)
 
     table = Table.grid(padding=(0, 3))
     table.add_row("layout", layout)
     table.add_row("rows", f"{contents.rows:,}")
     table.add_row("vehicles", f"{contents.vehicles:,}")
-    found = f"{len(recordings)}: {listed(counted, 6)}" if counted else "none with pairs"
-    table.add_row("recordings", found)
-    table.add_row("lanes", listed(lanes) or "not known")
-    table.add_row("pairs", f"{len(pairs):,} of {len(drivers):,} drivers, {_frames(pairs):,} frames")
-    table.add_row("time step", listed([f"{step:g} s" for step in steps]) or "-")
+    with_pairs = "none with pairs"
+    if recordings:
+        with_pairs = f"{len(recordings)}: {listed(_with_counts(recordings), 6)}"
+    table.add_row("recordings", with_pairs)
+    table.add_row("lanes", listed(sorted(lanes)) or "not known")
+    drivers = len(driver_names(pairs))
+    table.add_row("pairs", f"{len(pairs):,} of {drivers:,} drivers, {pairs.frames:,} frames")
+    table.add_row("time step", listed([f"{step:g} s" for step in sorted(steps)]) or "-")
     for duration in _THRESHOLDS_S:
-        count = sum(pair.lasts(duration) for pair in pairs)
-        table.add_row(f"  of at least {duration} s", f"{count:,}")
+        long = 0
+        for pair in pairs:
+            long += pair.lasts(duration)
+        table.add_row(f"  of at least {duration} s", f"{long:,}")
     for name, title in _TYPES.items():
-        types = Counter(getattr(pair, name) or "not known" for pair in pairs)
+        types: Counter[str] = Counter()
+        for pair in pairs:
+            types[getattr(pair, name) or "not known"] += 1
         if set(types) - {"not known"}:
-            table.add_row(title, listed([f"{one} ({count} pairs)" for one, count in types.items()]))
+            table.add_row(title, listed(_with_counts(types)))
     if truth:
         table.add_row("true parameters", f"known, of {listed(sorted(truth))}")
     return table
+
+
+def _with_counts(pairs: Mapping[str, int]) -> list[str]:
+    """Returns names with the number of pairs that each has."""
+    return [f"{name} ({count} pairs)" for name, count in pairs.items()]
 
 
 def _motion(pairs: PairSet) -> Table:
@@ -390,34 +435,33 @@ def _motion(pairs: PairSet) -> Table:
     for name, values in _quantities(pairs):
         if not len(values):
             continue
-        decimals = 0 if name == "frames" else 2
-        cells = [f"{value:.{decimals}f}" for value in np.quantile(values, list(_QUANTILES))]
+        decimals = 2
+        if name == "frames":
+            decimals = 0
+        quantiles = np.quantile(values, list(_QUANTILES)).tolist()
+        cells = [f"{value:.{decimals}f}" for value in quantiles]
         table.add_row(name, *cells)
     return table
 
 
 def _quantities(pairs: PairSet) -> Iterator[tuple[str, Floats]]:
     """Yields what the table of motion is about: a name with its unit, and the values."""
-    speed = _joined(pairs, "follower_speed")
-    gap = _joined(pairs, "gap")
-    headway = _joined(pairs, "leader_position") - _joined(pairs, "follower_position")
+    speed = over_frames(pairs, "follower_speed")
+    gap = over_frames(pairs, "gap")
+    headway = over_frames(pairs, "leader_position") - over_frames(pairs, "follower_position")
     moving = speed >= STANDING_MPS
     yield "frames", np.array([len(pair) for pair in pairs], dtype=np.float64)
-    yield "leader speed, m/s", _joined(pairs, "leader_speed")
+    yield "leader speed, m/s", over_frames(pairs, "leader_speed")
     yield "follower speed, m/s", speed
-    yield "follower acceleration, m/s2", _joined(pairs, "follower_acceleration")
+    yield "follower acceleration, m/s2", over_frames(pairs, "follower_acceleration")
     yield "gap (bumper to bumper), m", gap
     yield "space headway (front to front), m", headway
     yield f"time headway (above {STANDING_MPS:g} m/s), s", headway[moving] / speed[moving]
-    yield "leader length, m", np.array([pair.leader_length for pair in pairs])
-
-
-def _joined(pairs: PairSet, name: str) -> Floats:
-    return np.concatenate([getattr(pair, name) for pair in pairs])
+    yield "leader length, m", np.array(of_each(pairs, "leader_length"))
 
 
 def _counts(counts: Sequence[Dropped]) -> list[str]:
-    return [f"  {one.count:,} {one.unit}: {one.reason}" for one in counts]
+    return [f"  {dropped.count:,} {dropped.unit}: {dropped.reason}" for dropped in counts]
 
 
 def _suspicions(contents: Contents, check: Check, units: Mapping[str, str]) -> Iterator[str]:
@@ -426,15 +470,18 @@ def _suspicions(contents: Contents, check: Check, units: Mapping[str, str]) -> I
     if not len(pairs):
         yield "there is no leader-follower pair in it"
         return
-    if len({round(pair.dt, 9) for pair in pairs}) > 1:
+    steps, without_length = set(), 0
+    for pair in pairs:
+        steps.add(round(pair.dt, 9))
+        without_length += pair.leader_length == 0
+    if len(steps) > 1:
         yield (
             "the pairs have different time steps; a job needs one: set data.time_step, or split"
             " the file"
         )
-    without = sum(pair.leader_length == 0 for pair in pairs)
-    if without and not contents.has_gaps:
+    if without_length and not contents.has_gaps:
         yield (
-            f"{without} pairs have leaders of length 0: their gaps are bumper to bumper if"
+            f"{without_length} pairs have leaders of length 0: their gaps are bumper to bumper if"
             " leader positions are those of rear bumpers, and too long by a vehicle if not"
         )
     verdict = judge(pairs, check, units)

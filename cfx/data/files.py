@@ -64,7 +64,7 @@ class FileStart(NamedTuple):
                 return ()
         if not self.lines:
             return ()
-        return tuple(cell.strip().strip('"') for cell in re.split("[,;]", self.lines[0]))
+        return tuple([cell.strip().strip('"') for cell in re.split("[,;]", self.lines[0])])
 
     def has_columns(self, *names: str) -> bool:
         """Says whether the first line has all these cells."""
@@ -90,6 +90,11 @@ def beginning(path: Path) -> FileStart:
     if "\0" in text:
         text = ""
     return FileStart(path, start, tuple(text.splitlines()[:20]))
+
+
+def has_letters(text: str) -> bool:
+    """Says whether a text has a letter, as names of columns have and numbers have not."""
+    return any(character.isalpha() for character in text)
 
 
 def stem(path: Path) -> str:
@@ -164,13 +169,13 @@ def partitions(path: Path) -> list[Path]:
     """
     if not path.is_dir():
         return [path]
-    found = sorted(_parquet_files(path))
-    if not found:
+    files = sorted(_parquet_files(path))
+    if not files:
         raise DataError(
             f"{path}: is a folder without parquet files; set data.path to a file, or to a folder"
             f" such as pairs with pairs/{_COLUMN}NAME/part-0.parquet in it"
         )
-    return found
+    return files
 
 
 def are_partitions(path: Path) -> bool:
@@ -214,11 +219,16 @@ def of_recording(files: Sequence[Path], recording: str | None) -> list[Path]:
     """
     if recording is None:
         return list(files)
-    wanted = [file for file in files if recording_of(file) in {None, recording}]
-    if not wanted:
-        known = sorted({recording_of(file) or "" for file in files})
+    chosen, recordings = [], set()
+    for file in files:
+        name = recording_of(file)
+        recordings.add(name or "")
+        if name is None or name == recording:
+            chosen.append(file)
+    if not chosen:
+        known = sorted(recordings)
         raise DataError(
             f"data.recording={recording}: there is no such recording.{nearest(recording, known)}"
             f" Known: {listed(known)}."
         )
-    return wanted
+    return chosen

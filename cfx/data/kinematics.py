@@ -34,7 +34,7 @@ import numpy as np
 
 from cfx.data.files import Floats
 from cfx.data.pairs import Pair, PairSet
-from cfx.data.tracks import beyond_rates, driven
+from cfx.data.tracks import beyond_rates, distance_driven
 from cfx.data.units import factor
 
 _WINDOW_S = 5.0
@@ -81,21 +81,21 @@ class _Rule:
     left: float = math.inf
     typically_left: float = math.inf
 
-    def breaks_slope(self, found: Agreement) -> bool:
+    def breaks_slope(self, agreed: Agreement) -> bool:
         """Says whether a slope is out of its bounds; no if it says nothing."""
-        if found.spread < self.spread or found.unexplained > 0.95:
+        if agreed.spread < self.spread or agreed.unexplained > 0.95:
             return False
-        if found.slope <= 0:
+        if agreed.slope <= 0:
             return True
-        return abs(math.log(found.slope)) > self.floor + self.room * found.unexplained
+        return abs(math.log(agreed.slope)) > self.floor + self.room * agreed.unexplained
 
-    def leaves_over(self, found: Agreement) -> bool:
+    def leaves_over(self, agreed: Agreement) -> bool:
         """Says whether the integral may leave too much of the signal over."""
-        return self.tells(found) and found.left > self.left / 2
+        return self.tells(agreed) and agreed.left > self.left / 2
 
-    def tells(self, found: Agreement) -> bool:
+    def tells(self, agreed: Agreement) -> bool:
         """Says whether what the integral leaves over of a signal says anything."""
-        return found.change >= 2 * self.spread and found.missed < _MISSED
+        return agreed.change >= 2 * self.spread and agreed.missed < _MISSED
 
 
 _WHOLE = _Rule(spread=10.0, floor=0.17, room=0.0)
@@ -197,10 +197,13 @@ def agreement(values: Floats, rates: Floats, dt: float, *, whole: bool = False) 
     unknown = _step_errors(rates, dt)
     window = max(1, round(_WINDOW_S / dt))
     if not whole and len(values) > 2 * window:
-        some = slice(None, None, max(1, (len(values) - window) // _WINDOWS))
-        y, mean, turn, unknown = (
-            (course[window:] - course[:-window])[some] for course in (y, mean, turn, unknown)
-        )
+        stride = max(1, (len(values) - window) // _WINDOWS)
+
+        def over_windows(course: Floats) -> Floats:
+            return (course[window:] - course[:-window])[::stride]
+
+        y, mean = over_windows(y), over_windows(mean)
+        turn, unknown = over_windows(turn), over_windows(unknown)
     y = y - _quantile(y, 0.5)
     of_y = math.sqrt(float(y @ y))
     x, of_x, correlation = _best_integral(y, of_y, mean, turn)
@@ -300,22 +303,23 @@ class Contradiction:
         """Returns what a slope says, and of which unit, sign or time step it is."""
         step = f"the time step looks like {slope * self.dt:.3g} s, not {self.dt:.3g} s"
         other = self.other_slope
-        own = _units_of(self.signals.partition("_")[0], units)
+        read_in = _units_of(self.signals.partition("_")[0], units)
         room = _SAME
         if self.quantity == "gap":
             said = f"the gap changes {slope:.3g} times as the relative speed says"
-            known = {-1.0: "the leader's and the follower's columns look swapped"}
-            known |= _factors(own, slower=("gap",), faster=("speed",))
+            explanations = {-1.0: "the leader's and the follower's columns look swapped"}
+            explanations |= _factors(read_in, slower=("gap",), faster=("speed",))
             otherwise = (
-                f"gaps must be in {own['gap']}, speeds in {own['speed']}, times in {own['time']}"
+                f"gaps must be in {read_in['gap']}, speeds in {read_in['speed']}, times in"
+                f" {read_in['time']}"
             )
             room = _SAME_GAP
         elif self.quantity == "speed":
             said = f"speeds change {slope:.3g} times as much as the accelerations say"
             if other is not None and abs(other - 1) > _TYPICAL and abs(slope / other - 1) < _SAME:
                 return f"{said}, and positions as much more than the speeds say, so {step}"
-            known = _ACCELERATION_FACTORS | _factors(
-                own, faster=("acceleration",), slower=("speed",)
+            explanations = _ACCELERATION_FACTORS | _factors(
+                read_in, faster=("acceleration",), slower=("speed",)
             )
             otherwise = f"they are {1 / slope:.2g} times what the speeds say; write m/s2"
         else:
@@ -325,14 +329,15 @@ class Contradiction:
             if other is not None and abs(other / slope - 1) < _SAME:
                 said += ": speeds change as much faster than the accelerations say"
                 return f"{said}, so {step}"
-            known = _factors(own, faster=("speed", "time"), slower=("position",))
+            explanations = _factors(read_in, faster=("speed", "time"), slower=("position",))
             otherwise = (
-                f"positions must be in {own['position']}, speeds in {own['speed']}, times in"
-                f" {own['time']}, and all of this vehicle"
+                f"positions must be in {read_in['position']}, speeds in {read_in['speed']}, times"
+                f" in {read_in['time']}, and all of this vehicle"
             )
-        nearest = min(known, key=lambda one: abs(slope / one - 1))
-        is_near = abs(slope / nearest - 1) < room
-        return f"{said}: {known[nearest] if is_near else otherwise}"
+        nearest = min(explanations, key=lambda expected: abs(slope / expected - 1))
+        if abs(slope / nearest - 1) < room:
+            return f"{said}: {explanations[nearest]}"
+        return f"{said}: {otherwise}"
 
 
 class _Relation(NamedTuple):
@@ -352,7 +357,9 @@ class _Relation(NamedTuple):
         self, slope: float | None, words: str = "", also: Agreement | None = None
     ) -> Contradiction:
         """Returns that the two contradict each other; `also` is of the vehicle's other signal."""
-        other_slope = also.slope if also is not None and also.unexplained < 0.2 else None
+        other_slope = None
+        if also is not None and also.unexplained < 0.2:
+            other_slope = also.slope
         return Contradiction(self.signals, self.quantity, slope, words, self.pair.dt, other_slope)
 
 
@@ -380,21 +387,23 @@ def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | Non
     for who, other in (("leader", "follower"), ("follower", "leader")):
         position, speed = _relations(pair, who)
         of_position, of_speed = _relations(pair, other)
-        found = _broken(position, of_position, speed.measured())
-        if found is not None:
-            return _by_gap(found, pair, units or {})
-        found = _broken(speed, of_speed, position.measured(whole=True))
-        if found is not None:
-            return found
-    found = _over_windows(_gap_relation(pair), None, None)
-    return None if found is None else _by_gap(found, pair, units or {})
+        problem = _broken(position, of_position, speed.measured())
+        if problem is not None:
+            return _by_gap(problem, pair, units or {})
+        problem = _broken(speed, of_speed, position.measured(whole=True))
+        if problem is not None:
+            return problem
+    problem = _over_windows(_gap_relation(pair), None, None)
+    if problem is None:
+        return None
+    return _by_gap(problem, pair, units or {})
 
 
 def _broken(relation: _Relation, other: _Relation, also: Agreement) -> Contradiction | None:
     """Returns that a signal is not what its rate says; `also` is of this vehicle's other signal."""
-    found = _leap(relation) or _constant(relation)
-    if found is not None:
-        return found
+    problem = _leap(relation) or _constant(relation)
+    if problem is not None:
+        return problem
     if relation.quantity == "position":
         whole = relation.measured(whole=True)
         if _WHOLE.breaks_slope(whole):
@@ -406,17 +415,17 @@ def _over_windows(
     relation: _Relation, other: _Relation | None, also: Agreement | None
 ) -> Contradiction | None:
     """Returns that a signal's changes over windows are not what its rate says; as `_broken`."""
-    rule, found = _RULES[relation.quantity], relation.measured()
-    if rule.breaks_slope(found):
-        return relation.broken(found.slope, also=also)
-    if not rule.leaves_over(found):
+    rule, agreed = _RULES[relation.quantity], relation.measured()
+    if rule.breaks_slope(agreed):
+        return relation.broken(agreed.slope, also=also)
+    if not rule.leaves_over(agreed):
         return None
-    why = _why_left_over(relation, other, found.left)
-    if not why and found.left < rule.left:
+    why = _why_left_over(relation, other, agreed.left)
+    if not why and agreed.left < rule.left:
         return None
     words = (
         f"over {_WINDOW_S:g} s the one changes otherwise than the other says, by"
-        f" {found.left:.0%} of the change: {why or 'are they of this vehicle, at this time?'}"
+        f" {agreed.left:.0%} of the change: {why or 'are they of this vehicle, at this time?'}"
     )
     return relation.broken(None, words)
 
@@ -438,7 +447,9 @@ def _why_left_over(relation: _Relation, other: _Relation | None, share: float) -
             if again < rest:
                 late, rest = frames, again
     if rest < share / 2.5:
-        words = "later" if late > 0 else "earlier"
+        words = "earlier"
+        if late > 0:
+            words = "later"
         return f"they go together if the second is taken {abs(late) * dt:.3g} s {words}"
     return ""
 
@@ -467,24 +478,27 @@ def _leap(relation: _Relation) -> Contradiction | None:
 
 def _constant(relation: _Relation) -> Contradiction | None:
     """Returns that one signal is the same in all frames although the other says otherwise."""
-    same = [bool((one == one[0]).all()) for one in (relation.values, relation.rates)]
-    if same[0] == same[1]:
+    signal, rate = relation.signals.split(" and ")
+    has_constant_values = bool((relation.values == relation.values[0]).all())
+    has_constant_rates = bool((relation.rates == relation.rates[0]).all())
+    if has_constant_values == has_constant_rates:
         return None
     # Positions grow at a constant speed, too.
-    whole = relation.measured(whole=not (same[1] and relation.quantity == "position"))
+    whole = relation.measured(whole=not (has_constant_rates and relation.quantity == "position"))
     if whole.spread < 2 * _RULES[relation.quantity].spread or whole.left < 0.5:
         return None
-    name = relation.signals.split(" and ")[same.index(True)]
-    value = (relation.values, relation.rates)[same.index(True)][0]
+    name, value = signal, relation.values[0]
+    if has_constant_rates:
+        name, value = rate, relation.rates[0]
     words = f"{name} is {value:.3g} in every frame, and the other changes"
     return relation.broken(None, words)
 
 
-def _by_gap(found: Contradiction, pair: Pair, units: Units) -> Contradiction:
+def _by_gap(problem: Contradiction, pair: Pair, units: Units) -> Contradiction:
     """Returns a contradiction in the words of a file that has gaps in place of positions."""
-    own = _units_of("follower", units)
-    if found.quantity == "speed" or not _has_gaps_alone(pair):
-        return found
+    read_in = _units_of("follower", units)
+    if problem.quantity == "speed" or not _has_gaps_alone(pair):
+        return problem
     gap, leader, follower = pair.gap, pair.leader_speed, pair.follower_speed
     swapped = "the leader's and the follower's speeds look swapped, or the gap's sign turned"
     corrected = {swapped: (gap, follower, leader)}
@@ -494,75 +508,78 @@ def _by_gap(found: Contradiction, pair: Pair, units: Units) -> Contradiction:
         follower,
     )
     slope = _gap_relation(pair).measured().slope
-    of_all: dict[str, float] = {}
+    slopes_of: dict[str, float] = {}
     for unit in _LIKELY["gap"]:
-        if unit == own["gap"]:
+        if unit == read_in["gap"]:
             continue
-        scale = factor(unit, "m") / factor(own["gap"], "m")
-        of_all[f"the gaps look like {unit}, not {own['gap']}"] = 1 / scale
+        scale = factor(unit, "m") / factor(read_in["gap"], "m")
+        slopes_of[f"the gaps look like {unit}, not {read_in['gap']}"] = 1 / scale
     for unit in _LIKELY_BY_GAP:
-        if unit == own["speed"]:
+        if unit == read_in["speed"]:
             continue
-        scale = factor(unit, "m/s") / factor(own["speed"], "m/s")
-        look = f"look like {unit}, not {own['speed']}"
-        of_all[f"the speeds {look}"] = scale
+        scale = factor(unit, "m/s") / factor(read_in["speed"], "m/s")
+        look = f"look like {unit}, not {read_in['speed']}"
+        slopes_of[f"the speeds {look}"] = scale
         corrected[f"the leader's speeds {look}"] = (gap, leader * scale, follower)
         corrected[f"the follower's speeds {look}"] = (gap, leader, follower * scale)
-    known = {words: one for words, one in of_all.items() if abs(slope / one - 1) < _SAME_GAP}
-    if not known and slope > 0:
-        known[f"the time step looks like {slope * pair.dt:.3g} s, not {pair.dt:.3g} s"] = slope
-    for words, scale in known.items():
+    likely = dict(slopes_of)
+    for words, expected in slopes_of.items():
+        if abs(slope / expected - 1) >= _SAME_GAP:
+            del likely[words]
+    if not likely and slope > 0:
+        likely[f"the time step looks like {slope * pair.dt:.3g} s, not {pair.dt:.3g} s"] = slope
+    for words, scale in likely.items():
         corrected[words] = (gap, leader * scale, follower * scale)
-    best, least, rule = found.words, 0.5, _RULES["gap"]
+    best, least, rule = problem.words, 0.5, _RULES["gap"]
     for words, (gaps, ahead, behind) in corrected.items():
         after = agreement(gaps, ahead - behind, pair.dt)
         if after.left < least and not rule.breaks_slope(after):
             best, least = words, after.left
-    return replace(found, signals="gap and speeds", quantity="gap", slope=slope, words=best)
+    return replace(problem, signals="gap and speeds", quantity="gap", slope=slope, words=best)
 
 
 def _has_gaps_alone(pair: Pair) -> bool:
     """Says whether positions follow from gaps and speeds, as where a file has none."""
-    left = pair.leader_position - pair.leader_length - driven(pair.leader_speed, pair.dt)
+    left = pair.leader_position - pair.leader_length - distance_driven(pair.leader_speed, pair.dt)
     return bool(np.abs(left).max() < 1e-6)
 
 
 def _units_of(who: str, units: Units) -> dict[str, str]:
     """Returns the unit of each quantity of the leader or the follower."""
-    own = {}
+    units_read = {}
     for quantity, si in _SI.items():
         name = quantity
         if who == "leader" and quantity not in {"gap", "time"}:
             name = f"leader_{quantity}"
-        own[quantity] = units.get(name, si)
-    return own
+        units_read[quantity] = units.get(name, si)
+    return units_read
 
 
 def _factors(
-    own: Units, faster: Sequence[str] = (), slower: Sequence[str] = ()
+    read_in: Units, faster: Sequence[str] = (), slower: Sequence[str] = ()
 ) -> dict[float, str]:
     """Returns what slopes say of units: the slope, and the unit that a quantity seems to have.
 
     Args:
-        own: the unit in which each quantity was read.
+        read_in: the unit in which each quantity was read.
         faster: quantities whose integral grows too fast where they are in a smaller unit.
         slower: quantities that are integrals.
     """
-    found: dict[float, str] = {}
+    explanations: dict[float, str] = {}
     for quantity in (*faster, *slower):
-        read = factor(own[quantity], _SI[quantity])
+        read = factor(read_in[quantity], _SI[quantity])
         for unit in _LIKELY[quantity]:
             scale = factor(unit, _SI[quantity]) / read
             if quantity in slower:
                 scale = 1 / scale
-            if unit == own[quantity]:
+            if unit == read_in[quantity]:
                 continue
-            words = f"the {quantity}s look like {unit}, not {own[quantity]}"
-            same = [one for one in found if abs(one / scale - 1) < 1e-9]
-            for one in same:
-                words = f"{found.pop(one)}, or {words}"
-            found[scale] = words
-    return found
+            words = f"the {quantity}s look like {unit}, not {read_in[quantity]}"
+            for expected in list(explanations):
+                if abs(expected / scale - 1) < 1e-9:
+                    words = f"{explanations.pop(expected)}, or {words}"
+            explanations[scale] = words
+    return explanations
 
 
 def contradictions(
@@ -570,9 +587,9 @@ def contradictions(
 ) -> Iterator[tuple[str, Contradiction]]:
     """Yields the id of each pair that contradicts itself, and how."""
     for pair in pairs:
-        found = contradiction(pair, units)
-        if found is not None:
-            yield pair.pair_id, found
+        problem = contradiction(pair, units)
+        if problem is not None:
+            yield pair.pair_id, problem
 
 
 def typical_contradiction(pairs: PairSet) -> Contradiction | None:
@@ -585,16 +602,16 @@ def typical_contradiction(pairs: PairSet) -> Contradiction | None:
     missed: dict[tuple[str, str], list[float]] = {}
     for pair in pairs:
         relations = (*_relations(pair, "leader"), *_relations(pair, "follower"))
-        for one in (*relations, _gap_relation(pair)):
-            key = one.signals, one.quantity
-            found, rule = one.measured(), _RULES[one.quantity]
-            if rule.tells(found):
-                left.setdefault(key, []).append(found.left)
-            if one.quantity == "position":
-                found, rule = one.measured(whole=True), _WHOLE
-            if found.spread >= rule.spread and found.slope > 0:
-                slopes.setdefault(key, []).append(math.log(found.slope))
-                missed.setdefault(key, []).append(found.missed)
+        for relation in (*relations, _gap_relation(pair)):
+            key = relation.signals, relation.quantity
+            agreed, rule = relation.measured(), _RULES[relation.quantity]
+            if rule.tells(agreed):
+                left.setdefault(key, []).append(agreed.left)
+            if relation.quantity == "position":
+                agreed, rule = relation.measured(whole=True), _WHOLE
+            if agreed.spread >= rule.spread and agreed.slope > 0:
+                slopes.setdefault(key, []).append(math.log(agreed.slope))
+                missed.setdefault(key, []).append(agreed.missed)
     for key, logs in slopes.items():
         median, room = _median(logs)
         # Where a rate is smooth, what its integral misses goes with the signal and changes the

@@ -9,8 +9,9 @@ Shapes: P pairs, T frames of the longest pair.
 from __future__ import annotations
 
 import hashlib
+import itertools
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +20,7 @@ from numpy.typing import NDArray
 
 from cfx.core import memory
 from cfx.data.names import name_of
+from cfx.data.signals import RECORDED, Signal
 from cfx.errors import DataError
 
 if TYPE_CHECKING:
@@ -26,26 +28,19 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 Array = NDArray[np.float64]
-SIGNALS = (
-    "leader_position",
-    "leader_speed",
-    "leader_acceleration",
-    "follower_position",
-    "follower_speed",
-    "follower_acceleration",
-)
 
 _LIKENESS_FRAMES = 8
 """Frames of a pair at which its likeness is taken."""
 
-_ALIKE = 0.1 + 1e-9
+_TOLERANCE = 0.1 + 1e-9
 """m/s and m; the same trajectory saved with one decimal differs by less, two drivers by more."""
 
-_LIVELY_MPS, _TELLING_FRAMES = 1.0, 40
-"""m/s, frames: drivers may be alike whose speeds differ by less, or of whom less is known."""
+_MIN_SPEED_RANGE_MPS, _MIN_FRAMES = 1.0, 40
+"""Two recordings are compared only if the speed varies by at least this much over at least this
+many frames. Shorter or steadier ones look alike by chance."""
 
-_TOGETHER = 1024
-"""Pairs that one part of the work reads before their signals are let go of."""
+_PAIRS_AT_ONCE = 1024
+"""Pairs that are read before the memory of their signals is released, which may lie in files."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +62,7 @@ class Pair:
         site: the road or area that the recording was made at; several recordings may share one.
         vehicle: the follower's name over all recordings, "" where ids mean something within one
             recording alone.
+        surroundings: further signals, as measured, `(T,)` each (`cfx.data.signals`).
         truth: true parameters over time, name -> `(T,)`, known only for synthetic pairs.
         truth_model: name of the model these parameters belong to.
     """
@@ -91,11 +87,16 @@ class Pair:
     leader_driver_type: str = ""
     site: str = ""
     vehicle: str = ""
+    surroundings: Mapping[Signal, Array] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         for name in ("pair_id", "recording", "leader_id", "follower_id"):
             object.__setattr__(self, name, name_of(getattr(self, name)))
-        shapes = {name: getattr(self, name).shape for name in SIGNALS}
+        shapes = {}
+        for name in RECORDED:
+            shapes[name] = getattr(self, name).shape
+        for signal, values in self.surroundings.items():
+            shapes[signal.name] = values.shape
         if len(set(shapes.values())) != 1 or len(shapes["leader_position"]) != 1:
             raise DataError(
                 f"pair {self.pair_id}: all signals must have the same length, got {shapes}"
@@ -116,6 +117,20 @@ class Pair:
         # A share of a frame less than a millionth is rounding: 70 s are 700 frames of 0.1 s.
         return len(self) >= max(2.0, duration / self.dt - 1e-6)
 
+    def beginning(self, frames: int) -> Pair:
+        """Returns the pair over its first frames; all of it where it has no more."""
+        return self.with_arrays(lambda values: values[:frames])
+
+    def with_arrays(self, change: Callable[[Array], Array]) -> Pair:
+        """Returns the pair with all that it has over time changed alike."""
+        changed: dict[str, Any] = {}
+        for name in RECORDED:
+            changed[name] = change(getattr(self, name))
+        for name in ("truth", "surroundings"):
+            arrays = getattr(self, name)
+            changed[name] = {key: change(values) for key, values in arrays.items()}
+        return replace(self, **changed)
+
     @property
     def driver(self) -> str:
         """Who drives the follower, unique across recordings.
@@ -123,9 +138,11 @@ class Pair:
         A vehicle that keeps its name over recordings is one driver with adaptive cruise control and
         another one without.
         """
-        if self.vehicle:
-            return f"{self.vehicle} ({self.driver_type})" if self.driver_type else self.vehicle
-        return f"{self.recording}/{self.follower_id}"
+        if not self.vehicle:
+            return f"{self.recording}/{self.follower_id}"
+        if not self.driver_type:
+            return self.vehicle
+        return f"{self.vehicle} ({self.driver_type})"
 
     @property
     def gap(self) -> Array:
@@ -149,15 +166,20 @@ class Pair:
         In plain numbers: frames, time step (ms), then at frames evenly spread over the pair both
         speeds (m/s) and the gap (m); see `LearnedFrom`.
         """
-        at = np.linspace(0, len(self) - 1, _LIKENESS_FRAMES).round().astype(np.int64)
-        values = (self.leader_speed[at], self.follower_speed[at], self.gap[at])
-        numbers = [f"{value:.2f}" for value in np.concatenate(values)]
-        return " ".join([str(len(self)), f"{1000 * self.dt:.0f}", *numbers])
+        frames = np.linspace(0, len(self) - 1, _LIKENESS_FRAMES).round().astype(np.int64)
+        values = (self.leader_speed[frames], self.follower_speed[frames], self.gap[frames])
+        words = [str(len(self)), f"{1000 * self.dt:.0f}"]
+        for value in np.concatenate(values):
+            words.append(f"{value:.2f}")
+        return " ".join(words)
 
     def _digest(self, header: str) -> str:
         digest = hashlib.sha256(header.encode())
-        for name in SIGNALS:
+        for name in RECORDED:
             digest.update(np.ascontiguousarray(getattr(self, name), dtype=np.float64).tobytes())
+        for signal, values in self.surroundings.items():
+            digest.update(repr(signal).encode())
+            digest.update(np.ascontiguousarray(values, dtype=np.float64).tobytes())
         return digest.hexdigest()
 
 
@@ -173,19 +195,39 @@ class LearnedFrom:
     """
 
     def __init__(self, likenesses: Iterable[str]) -> None:
-        found: dict[str, list[Array]] = {}
-        for one in likenesses:
-            length, numbers = _numbers(one)
-            found.setdefault(length, []).append(numbers)
-        self._known = {length: np.array(numbers) for length, numbers in found.items()}
+        rows: dict[str, list[Array]] = {}
+        for likeness in likenesses:
+            length, numbers = _parsed(likeness)
+            rows.setdefault(length, []).append(numbers)
+        self._by_length: dict[str, Array] = {}
+        for length, same_length in rows.items():
+            self._by_length[length] = np.array(same_length)
 
     def __contains__(self, pair: Pair) -> bool:
-        length, numbers = _numbers(pair.likeness)
-        known = self._known.get(length)
-        return known is not None and bool((np.abs(known - numbers) <= _ALIKE).all(1).any())
+        length, numbers = _parsed(pair.likeness)
+        candidates = self._by_length.get(length)
+        if candidates is None:
+            return False
+        agrees = np.abs(candidates - numbers) <= _TOLERANCE
+        return bool(agrees.all(1).any())
 
 
-def _numbers(likeness: str) -> tuple[str, Array]:
+def driver_names(pairs: Iterable[Pair]) -> set[str]:
+    """Returns the names of the followers' drivers."""
+    return {pair.driver for pair in pairs}
+
+
+def of_each(pairs: Iterable[Pair], name: str) -> list[Any]:
+    """Returns an attribute of each pair."""
+    return [getattr(pair, name) for pair in pairs]
+
+
+def over_frames(pairs: Iterable[Pair], name: str) -> Array:
+    """Returns a signal, or the gap, over the frames of all pairs, one pair after the other."""
+    return np.concatenate(of_each(pairs, name))
+
+
+def _parsed(likeness: str) -> tuple[str, Array]:
     """Returns a likeness's frames and time step, and its speeds and gaps, `(24,)`."""
     frames, step, *numbers = likeness.split()
     return f"{frames} {step}", np.array(numbers, dtype=np.float64)
@@ -197,25 +239,45 @@ def twins(pairs: Sequence[Pair]) -> list[tuple[str, str]]:
     Pairs whose speed hardly changes, and short ones, are none: many may drive so.
     """
     by_length: dict[str, list[tuple[int, Array]]] = {}
-    for at, pair in enumerate(pairs):
-        length, numbers = _numbers(pair.likeness)
+    for place, pair in enumerate(pairs):
+        length, numbers = _parsed(pair.likeness)
         speeds = numbers[_LIKENESS_FRAMES : 2 * _LIKENESS_FRAMES]
-        if len(pair) >= _TELLING_FRAMES and np.ptp(speeds) > _LIVELY_MPS:
-            by_length.setdefault(length, []).append((at, numbers))
-    found = []
-    for same in by_length.values():
-        values = np.array([numbers for _, numbers in same])
-        order = np.argsort(values.sum(1))
-        values, total = values[order], values.sum(1)[order]
-        for further in range(1, len(same)):
-            near = total[further:] - total[:-further] <= _ALIKE * values.shape[1]
-            if not near.any():
-                break
-            (first,) = np.nonzero(near)
-            alike = np.abs(values[first] - values[first + further]).max(1) <= _ALIKE
-            for one in first[alike].tolist():
-                found.append(sorted(same[order[k]][0] for k in (one, one + further)))
-    return [(pairs[one].pair_id, pairs[other].pair_id) for one, other in sorted(found)]
+        if len(pair) >= _MIN_FRAMES and np.ptp(speeds) > _MIN_SPEED_RANGE_MPS:
+            by_length.setdefault(length, []).append((place, numbers))
+    places: list[tuple[int, int]] = []
+    for same_length in by_length.values():
+        places_of_length, numbers_of_length = zip(*same_length, strict=True)
+        places += _places_alike(np.array(places_of_length), np.array(numbers_of_length))
+    ids = []
+    for earlier, later in sorted(places):
+        ids.append((pairs[earlier].pair_id, pairs[later].pair_id))
+    return ids
+
+
+def _places_alike(places: NDArray[np.int64], values: Array) -> list[tuple[int, int]]:
+    """Returns the places of any two pairs of one length that agree, the earlier one first.
+
+    The sums of two pairs that agree differ by no more than the tolerance times the numbers that are
+    compared. So pairs are sorted by their sums, and each is compared with its neighbours alone,
+    until even the nearest are too far apart.
+
+    Args:
+        places: of P pairs, `(P,)`.
+        values: their speeds and gaps, `(P, 24)`.
+    """
+    order = np.argsort(values.sum(1))
+    places, values, sums = places[order], values[order], values.sum(1)[order]
+    alike = []
+    for distance in range(1, len(values)):
+        is_near = sums[distance:] - sums[:-distance] <= _TOLERANCE * values.shape[1]
+        if not is_near.any():
+            break
+        (first,) = np.nonzero(is_near)
+        differences = np.abs(values[first] - values[first + distance]).max(1)
+        for row in first[differences <= _TOLERANCE].tolist():
+            earlier, later = sorted((int(places[row]), int(places[row + distance])))
+            alike.append((earlier, later))
+    return alike
 
 
 @dataclass(frozen=True)
@@ -274,14 +336,22 @@ class PairSet(Sequence[Pair]):
         return self.pairs[index]
 
     def __iter__(self) -> Iterator[Pair]:
-        for start in range(0, len(self.pairs), _TOGETHER):
-            yield from self.pairs[start : start + _TOGETHER]
+        for start in range(0, len(self.pairs), _PAIRS_AT_ONCE):
+            yield from self.pairs[start : start + _PAIRS_AT_ONCE]
             memory.release()
+
+    @property
+    def frames(self) -> int:
+        """The number of frames of all pairs."""
+        return sum(len(pair) for pair in self.pairs)
 
     @property
     def size(self) -> int:
         """Bytes of all signals."""
-        return len(SIGNALS) * 8 * sum(len(pair) for pair in self.pairs)
+        arrays = 0
+        for pair in self.pairs:
+            arrays += len(pair) * (len(RECORDED) + len(pair.surroundings))
+        return 8 * arrays
 
     def changed(self, change: Callable[[Pair], Pair | None]) -> PairSet:
         """Returns changed pairs, without those of which None is left.
@@ -291,14 +361,16 @@ class PairSet(Sequence[Pair]):
         """
         is_large = self.size >= memory.LARGE
         changed: list[Pair] = []
-        for start in range(0, len(self.pairs), _TOGETHER):
-            part = []
-            for pair in self.pairs[start : start + _TOGETHER]:
-                made = change(pair)
-                if made is not None:
-                    part.append(made)
-            some = replace(self, pairs=tuple(part))
-            changed += some.in_file() if is_large else some
+        for start in range(0, len(self.pairs), _PAIRS_AT_ONCE):
+            changed_pairs = []
+            for pair in self.pairs[start : start + _PAIRS_AT_ONCE]:
+                changed_pair = change(pair)
+                if changed_pair is not None:
+                    changed_pairs.append(changed_pair)
+            part = replace(self, pairs=tuple(changed_pairs))
+            if is_large:
+                part = part.in_file()
+            changed += part
             memory.release()
         return replace(self, pairs=tuple(changed))
 
@@ -308,9 +380,10 @@ class PairSet(Sequence[Pair]):
         Raises:
             OutputError: the disk is full.
         """
-        sizes = [len(pair) * (len(SIGNALS) + len(pair.truth)) for pair in self.pairs]
-        free = memory.in_file((sum(sizes),))
-        stored = []
+        size = 0
+        for pair in self.pairs:
+            size += len(pair) * (len(RECORDED) + len(pair.truth) + len(pair.surroundings))
+        free = memory.in_file((size,))
 
         def kept(array: Array) -> Array:
             nonlocal free
@@ -318,22 +391,22 @@ class PairSet(Sequence[Pair]):
             row[:] = array
             return row
 
+        stored = []
         for pair in self:
-            signals: dict[str, Any] = {name: kept(getattr(pair, name)) for name in SIGNALS}
-            truth = {name: kept(array) for name, array in pair.truth.items()}
-            stored.append(replace(pair, **signals, truth=truth))
+            stored.append(pair.with_arrays(kept))
         return replace(self, pairs=tuple(stored))
 
     def take(self, numbers: Sequence[int]) -> PairSet:
         """Returns the pairs at these places; nothing is counted as left out."""
-        return replace(self, pairs=tuple(self.pairs[number] for number in numbers))
+        return replace(self, pairs=tuple([self.pairs[number] for number in numbers]))
 
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:
         """Keeps the pairs marked True and counts the others under `reason`."""
-        kept = tuple(pair for pair, wanted in zip(self.pairs, keep, strict=True) if wanted)
-        lost = len(self.pairs) - len(kept)
-        dropped = (Dropped(reason, lost),) if lost else ()
-        return replace(self, pairs=kept, dropped=(*self.dropped, *dropped))
+        kept = tuple(itertools.compress(self.pairs, keep))
+        dropped = self.dropped
+        if len(kept) < len(self.pairs):
+            dropped = (*dropped, Dropped(reason, len(self.pairs) - len(kept)))
+        return replace(self, pairs=kept, dropped=dropped)
 
     @property
     def dt(self) -> float:
@@ -344,12 +417,31 @@ class PairSet(Sequence[Pair]):
         """
         steps = sorted({round(pair.dt, 9) for pair in self.pairs})
         if len(steps) != 1:
-            listed = ", ".join(f"{step:g} s" for step in steps)
+            in_words = ", ".join([f"{step:g} s" for step in steps])
             raise DataError(
-                f"{self.source}: the pairs have different time steps ({listed}); a job needs one:"
+                f"{self.source}: the pairs have different time steps ({in_words}); a job needs one:"
                 " bring them to one with data.time_step, or split the file"
             )
         return steps[0]
+
+    @property
+    def surroundings(self) -> tuple[Signal, ...]:
+        """The further signals, which every pair has.
+
+        Raises:
+            DataError: a pair has others than the first one.
+        """
+        signals: tuple[Signal, ...] = ()
+        if self.pairs:
+            signals = tuple(self.pairs[0].surroundings)
+        for pair in self.pairs:
+            if set(pair.surroundings) != set(signals):
+                expected = ", ".join([signal.name for signal in signals]) or "none"
+                raise DataError(
+                    f"{self.source}: pair {pair.pair_id} has other further signals than the first"
+                    f" pair ({expected}); give every pair the same"
+                )
+        return signals
 
     @property
     def fingerprint(self) -> str:
@@ -374,6 +466,8 @@ class PairBatch:
         lengths: `(P,)` int64, frames of each pair.
         mask: `(P, T)` bool, True within the pair.
         dt: time step, s.
+        surroundings: further signals, `(P, T)` each; in place of a gap the position of what is
+            ahead is stored, which does not depend on where the follower is (`Signal.seen_from`).
     """
 
     leader_position: Tensor
@@ -386,6 +480,7 @@ class PairBatch:
     lengths: Tensor
     mask: Tensor
     dt: float
+    surroundings: Mapping[Signal, Tensor] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -411,19 +506,26 @@ class PairBatch:
 
         if not len(pairs):
             raise DataError("no pairs to stack")
-        pair_set = pairs if isinstance(pairs, PairSet) else PairSet(tuple(pairs), "pairs")
-        dt, dtype = pair_set.dt, dtype or torch.float64
-        length = max(frames, *(len(pair) for pair in pair_set.pairs))
-        shape = (len(pair_set), length)
+        if not isinstance(pairs, PairSet):
+            pairs = PairSet(tuple(pairs), "pairs")
+        dt, dtype = pairs.dt, dtype or torch.float64
+        lengths = torch.tensor([len(pair) for pair in pairs.pairs])
+        length = max(frames, int(lengths.max()))
+        shape = (len(pairs), length)
         signals = {}
-        for name in SIGNALS:
+        for name in RECORDED:
             # Filled row by row: a list of rows would hold the signal twice.
-            values = memory.empty(shape, together=len(SIGNALS))
-            for row, pair in zip(values, pair_set, strict=True):
+            values = memory.empty(shape, together=len(RECORDED))
+            for row, pair in zip(values, pairs, strict=True):
                 row[:] = _extend(pair, name, length)
             signals[name] = torch.as_tensor(values).to(device=device, dtype=dtype)
-        leader_lengths = [pair.leader_length for pair in pair_set.pairs]
-        lengths = torch.tensor([len(pair) for pair in pair_set.pairs])
+        surroundings = {}
+        for signal in pairs.surroundings:
+            values = memory.empty(shape, together=len(pairs.surroundings))
+            for row, pair in zip(values, pairs, strict=True):
+                row[:] = _extended_surroundings(pair, signal, length)
+            surroundings[signal] = torch.as_tensor(values).to(device=device, dtype=dtype)
+        leader_lengths = of_each(pairs.pairs, "leader_length")
         mask = torch.as_tensor(memory.empty(shape, bool))
         torch.lt(torch.arange(length), lengths[:, None], out=mask)
         return cls(
@@ -432,6 +534,7 @@ class PairBatch:
             lengths=lengths.to(device),
             mask=mask.to(device),
             dt=dt,
+            surroundings=surroundings,
         )
 
     def __len__(self) -> int:
@@ -459,23 +562,42 @@ class PairBatch:
         return replace(self, lengths=last + 1, mask=mask).trimmed()
 
     def followed_by(self, other: PairBatch) -> PairBatch:
-        """Returns these pairs and those of another batch with room for as many frames."""
+        """Returns these pairs and those of another batch with room for as many frames.
+
+        Raises:
+            DataError: only one of them has a further signal.
+        """
         import torch
 
-        joined: dict[str, Any] = {}
-        for one in fields(self):
-            if one.name != "dt":
-                ours, theirs = getattr(self, one.name), getattr(other, one.name)
-                joined[one.name] = torch.cat([ours, theirs.to(ours)])
-        return replace(self, **joined)
+        if set(self.surroundings) != set(other.surroundings):
+            names = {signal.name for signal in {*self.surroundings} ^ {*other.surroundings}}
+            raise DataError(
+                f"pairs with and without the signal {' and '.join(sorted(names))} cannot be used"
+                " together; give it to all of them, or leave out the inputs of policies that read"
+                " it"
+            )
+
+        def joined(ours: Tensor, theirs: Tensor) -> Tensor:
+            return torch.cat([ours, theirs.to(ours)])
+
+        changed: dict[str, Any] = {}
+        for name in _TENSORS:
+            changed[name] = joined(getattr(self, name), getattr(other, name))
+        surroundings = {}
+        for signal, values in self.surroundings.items():
+            surroundings[signal] = joined(values, other.surroundings[signal])
+        return replace(self, **changed, surroundings=surroundings)
 
     def trimmed(self) -> PairBatch:
         """Returns the same pairs without the frames that none of them has."""
         frames = int(self.lengths.max())
         signals: dict[str, Any] = {}
-        for name in (*SIGNALS, "mask"):
+        for name in (*RECORDED, "mask"):
             signals[name] = getattr(self, name)[:, :frames]
-        return replace(self, **signals)
+        surroundings = {}
+        for signal, values in self.surroundings.items():
+            surroundings[signal] = values[:, :frames]
+        return replace(self, **signals, surroundings=surroundings)
 
     def __getitem__(self, index: Any) -> PairBatch:
         """Selects pairs (a slice, an index tensor or a boolean mask over P); time stays whole."""
@@ -486,10 +608,16 @@ class PairBatch:
     def _changed(self, change: Callable[[Tensor], Tensor]) -> PairBatch:
         """Returns these pairs with each of their tensors changed."""
         changed: dict[str, Any] = {}
-        for one in fields(self):
-            if one.name != "dt":
-                changed[one.name] = change(getattr(self, one.name))
-        return replace(self, **changed)
+        for name in _TENSORS:
+            changed[name] = change(getattr(self, name))
+        surroundings = {}
+        for signal, values in self.surroundings.items():
+            surroundings[signal] = change(values)
+        return replace(self, **changed, surroundings=surroundings)
+
+
+_TENSORS = (*RECORDED, "leader_length", "lengths", "mask")
+"""The tensors of a batch, its surroundings apart."""
 
 
 def _selected(values: Tensor, index: Any) -> Tensor:
@@ -500,7 +628,7 @@ def _selected(values: Tensor, index: Any) -> Tensor:
     if not is_copy or values.device.type != "cpu":
         return values[index]
     size = len(index) * values.shape[1] * values.itemsize
-    if len(SIGNALS) * size < memory.LARGE:
+    if len(RECORDED) * size < memory.LARGE:
         return values[index]
     rows = memory.in_file((len(index), values.shape[1]), values[:0].numpy().dtype)
     return torch.index_select(values, 0, index, out=torch.as_tensor(rows))
@@ -516,8 +644,29 @@ def _extend(pair: Pair, name: str, length: int) -> Array:
         tail = values[-1] + speed * pair.dt * np.arange(1, missing + 1)
         origin = float(pair.follower_position[0])
     else:
-        last = values[-1] if name.endswith("speed") else 0.0
+        last = 0.0  # an acceleration
+        if name.endswith("speed"):
+            last = values[-1]
         tail = np.full(missing, last)
         origin = 0.0
     extended: Array = np.concatenate([values, tail]) - origin
+    return extended
+
+
+def _extended_surroundings(pair: Pair, signal: Signal, length: int) -> Array:
+    """Returns a further signal `(length,)` as a batch stores it, continued beyond the end.
+
+    What is ahead goes on at the leader's last speed, there is no acceleration, and everything else
+    stays as it was.
+    """
+    values = np.asarray(pair.surroundings[signal], dtype=np.float64)
+    beyond = np.arange(1, length - len(values) + 1)
+    last = values[-1]
+    if signal.quantity == "acceleration":
+        last = 0.0
+    tail: Array = np.full(len(beyond), last)
+    if signal.quantity == "gap":
+        values = values + pair.follower_position - float(pair.follower_position[0])
+        tail = values[-1] + float(pair.leader_speed[-1]) * pair.dt * beyond
+    extended: Array = np.concatenate([values, tail])
     return extended

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.data.pairs import Pair, PairSet, twins
+from cfx.data.pairs import Pair, PairSet, of_each, twins
 from cfx.data.style import STANDING_MPS
 from cfx.data.tracks import beyond_rates
 
@@ -37,7 +37,7 @@ def doubts(pairs: PairSet) -> Iterator[str]:
     for remark in pairs.remarks:
         if not remark.is_contradiction:
             yield remark.text
-    length = float(np.median([pair.leader_length for pair in pairs]))
+    length = float(np.median(of_each(pairs, "leader_length")))
     if length > _LONG_M:
         yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
     if len(pairs) >= _MANY:
@@ -58,21 +58,21 @@ def doubts(pairs: PairSet) -> Iterator[str]:
             f"vehicles that stand are typically {np.median(gaps):.1f} m behind their leaders: are"
             " gaps from bumper to bumper, not from front to front or centre to centre?"
         )
-    far = [float(np.median(pair.gap)) for pair in pairs]
-    beyond = sum(gap > _FAR_M for gap in far)
-    if beyond:
-        worst = pairs[int(np.argmax(far))].pair_id
+    typical_gaps = np.array([float(np.median(pair.gap)) for pair in pairs])
+    far = np.count_nonzero(typical_gaps > _FAR_M)
+    if far:
+        worst, most = pairs[int(np.argmax(typical_gaps))].pair_id, float(typical_gaps.max())
         yield (
-            f"{beyond} of {len(pairs)} pairs are typically more than {_FAR_M:g} m apart ('{worst}':"
-            f" {max(far):,.0f} m): is the leader the vehicle ahead, are positions in one unit?"
+            f"{far} of {len(pairs)} pairs are typically more than {_FAR_M:g} m apart ('{worst}':"
+            f" {most:,.0f} m): is the leader the vehicle ahead, are positions in one unit?"
         )
     alike = twins(pairs)
     if alike:
-        one, other = alike[0]
+        original, copy = alike[0]
+        copies = {later for _, later in alike}
         yield (
-            f"{len({copy for _, copy in alike})} of {len(pairs)} pairs drive as another one does,"
-            f" to 0.1 m and m/s ('{other}' as '{one}'): leave copies out, or who is learned from"
-            " is tested too"
+            f"{len(copies)} of {len(pairs)} pairs drive as another one does, to 0.1 m and m/s"
+            f" ('{copy}' as '{original}'): leave copies out, or who is learned from is tested too"
         )
     for what, wrong in _DOUBTFUL.items():
         yield from _counted(pairs, what, wrong)

@@ -1,243 +1,181 @@
-"""Brings recorded signals to another time step or scale, and replaces noisy accelerations.
+"""Signals: what is measured of a follower and of their surroundings, declared once.
 
-Many recordings have accelerations that are differences of rounded or noisy speeds: between two
-frames they change by more than any car's does. Policies read accelerations and start with the
-driver's acceleration and jerk, so noise there makes jolts. The replacement is an exponential
-average of the past, smoothed twice so that it has a jerk too (R. G. Brown 1959, Statistical
-forecasting for inventory control), with the time constant that best predicts the change of speed,
-times the coefficient of that regression.
+`SIGNALS` are those that every recording gives. A further one, such as the rain or a second vehicle
+ahead, is a `Signal` that an input of policies declares (`cfx.plugin.PolicyInput.signals`); readers
+take it from its column, and it is given over time wherever a follower is simulated. What a signal
+is measured in, how it is scaled, continued beyond the end of a recording and moved along with a
+simulated follower follows from its `quantity`.
 """
 
 from __future__ import annotations
 
-import logging
-from dataclasses import replace
-from typing import Literal, NamedTuple
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-import pandas as pd
+from cfx.core import registry
+from cfx.errors import PluginError
 
-from cfx.data.files import Floats
-from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
+if TYPE_CHECKING:
+    from torch import Tensor
 
-log = logging.getLogger(__name__)
+Quantity = Literal["position", "gap", "speed", "acceleration", "other"]
+"""What kind of number a signal is.
 
-_ROUNDING = 1e-6
-"""Share of a step by which a recording may end before a frame of the new step and still have it."""
-
-COARSE_S = 0.15
-"""Time step above which calibrated parameters are biased noticeably (docs/readers.md)."""
-
-
-def resampled(pairs: PairSet, step: float) -> PairSet:
-    """Returns the same trajectories in frames `step` seconds apart.
-
-    Pairs that have this step already stay as they are. Between frames every signal is interpolated
-    by a monotone cubic (Fritsch and Butland 1984, SciPy's `PchipInterpolator`), which does not
-    overshoot: no speed is negative or above the fastest recorded one. Signals are not low-pass
-    filtered before. True parameters are those of the last frame before. A
-    trajectory ends at its last new frame; one with fewer than two is left out and counted.
-
-    Args:
-        step: s.
-    """
-    kept = pairs.changed(lambda pair: _pair(pair, step))
-    lost = len(pairs) - len(kept)
-    dropped = (Dropped(f"shorter than two steps of {step:g} s", lost),) if lost else ()
-    return replace(kept, dropped=(*pairs.dropped, *dropped))
+`position` is along the lane, `gap` the distance from the follower's front bumper to something
+ahead: it shrinks as the follower moves on. All but `other` are multiplied by `data.scale`.
+"""
 
 
-def frames_in_steps(frames: int, dt: float, step: float) -> int:
-    """Returns how many frames a trajectory has in another step.
-
-    Args:
-        frames: recorded, `dt` seconds apart.
-        dt, step: s.
-    """
-    return int((frames - 1) * dt / step + _ROUNDING) + 1
-
-
-def _pair(pair: Pair, step: float) -> Pair | None:
-    """Returns one pair in the new step; None if it has fewer than two frames then."""
-    if np.isclose(pair.dt, step, rtol=0, atol=1e-9):
-        return pair
-    from scipy.interpolate import PchipInterpolator
-
-    last = len(pair) - 1
-    frames = frames_in_steps(len(pair), pair.dt, step)
-    at = np.arange(frames) * (step / pair.dt)  # in recorded frames
-    if len(at) < 2:
-        return None
-    at = at.clip(max=last)
-    recorded = [np.asarray(getattr(pair, name), dtype=np.float64) for name in SIGNALS]
-    # The interpolator divides by slopes; an infinite quotient of a slope near 0 makes the slope 0.
-    with np.errstate(over="ignore"):
-        values = PchipInterpolator(np.arange(len(pair)), np.stack(recorded), axis=1)(at)
-    signals = dict(zip(SIGNALS, values, strict=True))
-    before = np.floor(at + _ROUNDING).astype(np.int64)
-    truth = {}
-    for name, value in pair.truth.items():
-        truth[name] = np.asarray(value)[before]
-    return replace(pair, dt=step, truth=truth, **signals)
-
-
-def scaled(pairs: PairSet, factor: float) -> PairSet:
-    """Returns pairs with all distances, speeds and accelerations multiplied by a factor.
-
-    Time and vehicles' lengths stay as they are, so every gap is multiplied too.
-    """
-    if factor == 1.0:
-        return pairs
-
-    def scale(pair: Pair) -> Pair:
-        signals = {name: getattr(pair, name) * factor for name in SIGNALS}
-        # The leader's rear bumper is scaled, then its length added again.
-        signals["leader_position"] = signals["leader_position"] + pair.leader_length * (1 - factor)
-        return replace(pair, **signals)
-
-    source = f"{pairs.source}, {factor:g} times as fast"
-    return replace(pairs.changed(scale), source=source)
-
-
-# --- noisy accelerations --------------------------------------------------------------------------
-
-Accelerations = Literal["smooth", "recorded"]
-"""Whether noisy accelerations are smoothed: `data.accelerations`."""
-
-TIME_CONSTANTS_S = (0.2, 0.3, 0.5, 0.75, 1.0, 1.5, 2.0, 3.0)
-"""Among which the best is chosen."""
-
-_AHEAD_S = 1.0
-"""How far ahead accelerations are to tell the speed."""
-
-_JERK_TIME_S, _MOST_JERK = 0.8, 5.0
-"""How a jerk is forgotten, and its bound, m/s3: as policies start (`cfx.models.composed`)."""
-
-_LOOKED_AT_S = 60.0
-"""Beginning of a pair from which the average is chosen."""
-
-_LEAST_S = 5.0
-"""A shorter pair is left as it is."""
-
-_NOTHING = 1e-12
-"""(m/s)2; below it nothing is divided by."""
-
-_WORTH = 0.9
-"""Squared errors of the average below this share of the recorded one's are worth it."""
-
-
-class Average(NamedTuple):
-    """Exponential average, applied twice, that replaces recorded accelerations.
+@dataclass(frozen=True)
+class Signal:
+    """One signal over time.
 
     Attributes:
-        constant: time constant of each of the two averages, s; 0: as recorded.
-        factor: how much of the average the speed follows, 0 to 1.
+        name: of the signal, as inputs of policies and drivers elsewhere call it.
+        unit: SI; "" for a number without one.
+        meaning: in a few words.
+        column: of the tidy layout.
+        quantity: what kind of number it is.
+        belongs_to: `follower`, whose signals are simulated in closed loop, or the `surroundings`,
+            whose signals are given over time.
+        low, high: the range that is physically possible; a recording outside is refused.
+
+    Raises:
+        PluginError: the range is empty, or there is no name or column.
     """
 
-    constant: float
-    factor: float
+    name: str
+    unit: str
+    meaning: str
+    column: str
+    quantity: Quantity = "other"
+    belongs_to: Literal["follower", "surroundings"] = "surroundings"
+    low: float = -math.inf
+    high: float = math.inf
 
-    def of(self, values: Floats, dt: float) -> Floats:
-        """Returns the average of values `(T,)` at each frame, of its past alone; `dt` in s."""
-        if self.constant == 0:
-            return values
-        return self.factor * smoothed_twice(values, self.constant, dt)
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier() or not self.column:
+            raise PluginError(
+                f"signal '{self.name}': give it a name of letters, digits and _, and the column of"
+                " the tidy layout that holds it"
+            )
+        if not self.low < self.high:
+            raise PluginError(f"signal '{self.name}': low={self.low:g} is not below {self.high:g}")
+
+    @property
+    def is_scaled(self) -> bool:
+        """Whether it grows with distances and speeds (`data.scale`)."""
+        return self.quantity != "other"
+
+    def seen_from(self, position: Tensor, stored: Tensor) -> Tensor:
+        """Returns the signal as a follower at a position sees it.
+
+        Args:
+            position: of the follower's front bumper, `(*batch, T)`, m.
+            stored: as `PairBatch.surroundings` stores it, `(*batch, T)`: of a gap, the position of
+                what is ahead.
+        """
+        if self.quantity == "gap":
+            return stored - position
+        return stored
 
 
-RECORDED = Average(0.0, 1.0)
-"""No averaging: the recorded values."""
-
-
-def with_usable_accelerations(pairs: PairSet, how: Accelerations) -> PairSet:
-    """Replaces accelerations that predict the speed worse than their moving average does.
-
-    Leader and follower are judged each on their own; speeds and positions stay as they are.
-
-    Args:
-        pairs: as recorded.
-        how: `recorded` changes nothing.
-    """
-    if how == "recorded":
-        return pairs
-    changed, constants = averaged(pairs)
-    if not constants:
-        return pairs
-    log.info(
-        "Accelerations of %d of %d pairs are noisy: averages of their past (time constants of %g to"
-        " %g s) stand for them; data.accelerations=recorded keeps them",
-        len(constants),
-        len(pairs),
-        min(constants),
-        max(constants),
+SIGNALS: dict[str, Signal] = {
+    signal.name: signal
+    for signal in (
+        Signal(
+            "leader_position", "m", "the leader's front bumper", "leader_position_m", "position"
+        ),
+        Signal("leader_speed", "m/s", "the leader's speed", "leader_speed_mps", "speed", low=0),
+        Signal(
+            "leader_acceleration",
+            "m/s2",
+            "the leader's acceleration",
+            "leader_acceleration_mps2",
+            "acceleration",
+        ),
+        Signal(
+            "follower_position",
+            "m",
+            "the follower's front bumper",
+            "follower_position_m",
+            "position",
+            "follower",
+        ),
+        Signal(
+            "follower_speed",
+            "m/s",
+            "the follower's speed",
+            "follower_speed_mps",
+            "speed",
+            "follower",
+            low=0,
+        ),
+        Signal(
+            "follower_acceleration",
+            "m/s2",
+            "the follower's acceleration",
+            "follower_acceleration_mps2",
+            "acceleration",
+            "follower",
+        ),
+        Signal("gap", "m", "to the leader, bumper to bumper", "gap_m", "gap", "follower"),
     )
-    return changed
+}
+"""The signals of every recording, by name."""
+
+RECORDED = tuple(name for name in SIGNALS if name != "gap")
+"""Those that are stored; the gap follows from positions and the leader's length."""
+
+OBSERVED = (
+    "leader_speed",
+    "leader_acceleration",
+    "follower_speed",
+    "follower_acceleration",
+    "gap",
+)
+"""Those that policies observe. Positions are not among them: a policy drives alike on every road.
+
+The order is that of the states which drivers elsewhere keep (`DriverState.history`)."""
 
 
-def averaged(pairs: PairSet) -> tuple[PairSet, list[float]]:
-    """Replaces noisy accelerations, and says of each changed pair over how long it averages, s."""
-    constants: list[float] = []
+def declared_by(name: str) -> tuple[Signal, ...]:
+    """Returns the signals that an input of policies reads, by its name.
 
-    def change(pair: Pair) -> Pair:
-        own = best_average(pair.follower_speed, pair.follower_acceleration, pair.dt)
-        ahead = best_average(pair.leader_speed, pair.leader_acceleration, pair.dt)
-        if own == ahead == RECORDED:
-            return pair
-        constants.append(max(own.constant, ahead.constant))
-        return replace(
-            pair,
-            follower_acceleration=own.of(pair.follower_acceleration, pair.dt),
-            leader_acceleration=ahead.of(pair.leader_acceleration, pair.dt),
-        )
-
-    return pairs.changed(change), constants
-
-
-def best_average(speed: Floats, acceleration: Floats, dt: float) -> Average:
-    """Returns the average of accelerations that best predicts the change of speed.
-
-    It is `RECORDED` where the acceleration as recorded tells as much, or where there is too little
-    to say.
-
-    Args:
-        speed: `(T,)`, m/s.
-        acceleration: `(T,)`, m/s2.
-        dt: time step, s.
+    Raises:
+        PluginError: no such input is installed, or it cannot be loaded.
     """
-    frames = min(len(speed), round(_LOOKED_AT_S / dt))
-    ahead = max(1, round(_AHEAD_S / dt))
-    if len(speed) * dt < _LEAST_S or dt >= _AHEAD_S:
-        return RECORDED
-    acceleration = acceleration[:frames]
-    follows = speed[ahead:frames] - speed[: frames - ahead]
-    lasts = ahead * dt
-    jerk_lasts = _JERK_TIME_S * (lasts + _JERK_TIME_S * np.expm1(-lasts / _JERK_TIME_S))
-
-    def judged(constant: float) -> tuple[float, Average]:
-        values = Average(constant, 1.0).of(acceleration, dt)
-        jerk = np.clip(np.diff(values, prepend=values[0]) / dt, -_MOST_JERK, _MOST_JERK)
-        expected = (values * lasts + jerk * jerk_lasts)[: frames - ahead]
-        factor = 1.0
-        if constant > 0:
-            scale = max(float(expected @ expected), _NOTHING)
-            factor = min(1.0, max(0.0, float(follows @ expected) / scale))
-        error = float(np.square(follows - factor * expected).mean())
-        return error, Average(constant, factor)
-
-    recorded, _ = judged(0.0)
-    error, best = min(judged(constant) for constant in TIME_CONSTANTS_S)
-    return best if error < _WORTH * recorded else RECORDED
+    declared: Any = registry.get("input", name)
+    signals: tuple[Signal, ...] = declared.signals
+    return signals
 
 
-def smoothed_twice(values: Floats, constant: float, dt: float) -> Floats:
-    """Returns the exponential average of the exponential average, `(T,)`, of the past alone.
+def further_signals(signals: Iterable[Signal]) -> tuple[Signal, ...]:
+    """Returns the signals that are not `SIGNALS`, each once, in order.
 
-    Args:
-        values: `(T,)`; the first stands for those before it.
-        constant: time constant of both, s.
-        dt: time step, s.
+    Raises:
+        PluginError: two different signals share a name or a column, one redefines a signal of every
+            recording, or is said to be simulated.
     """
-    share = -np.expm1(-dt / constant)
-    average = pd.Series(values)
-    for _ in range(2):
-        average = average.ewm(alpha=share, adjust=False).mean()
-    return np.asarray(average, np.float64)
+    chosen: dict[str, Signal] = {}
+    columns = {signal.column: signal for signal in SIGNALS.values()}
+    for signal in signals:
+        if SIGNALS.get(signal.name) == signal:
+            continue
+        other = chosen.get(signal.name) or SIGNALS.get(signal.name) or columns.get(signal.column)
+        if other is not None and other != signal:
+            raise PluginError(
+                f"the signal '{signal.name}' (column {signal.column}) is declared in two ways, also"
+                f" as '{other.name}' (column {other.column}); give one of them another name and"
+                " column"
+            )
+        if signal.belongs_to == "follower" or signal.quantity == "position":
+            raise PluginError(
+                f"the signal '{signal.name}' must belong to the surroundings and be no position:"
+                " what the follower does is simulated, from the signals of every recording"
+            )
+        chosen[signal.name] = signal
+        columns[signal.column] = signal
+    return tuple(chosen.values())

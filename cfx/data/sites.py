@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from typing import Annotated
@@ -10,7 +11,7 @@ from typing import Annotated
 from pydantic import AfterValidator
 from pydantic_core import PydanticCustomError
 
-from cfx.data.pairs import Pair, PairSet
+from cfx.data.pairs import PairSet
 from cfx.errors import DataError, listed
 
 SiteNames = str | dict[str, str] | None
@@ -54,31 +55,42 @@ def with_sites(pairs: PairSet, names: SiteNames) -> PairSet:
         return pairs
     if isinstance(names, str):
         return replace(pairs, pairs=tuple(replace(pair, site=names) for pair in pairs))
-    found: dict[tuple[str, str], str | None] = {}
-    used = set()
+    pattern_of: dict[tuple[str, str], str] = {}
+    unnamed = []
     for pair in pairs:
-        key = (pair.recording, pair.site)
-        if key not in found:
-            fits = [one for one in names if any(fnmatchcase(name, one) for name in key)]
-            used.update(fits[:1])
-            found[key] = names[fits[0]] if fits else None
-    unnamed = [recording for (recording, _), site in found.items() if site is None]
+        recording_and_file = (pair.recording, pair.site)
+        if recording_and_file in pattern_of:
+            continue
+        pattern = _first_that_fits(names, recording_and_file)
+        if pattern is None:
+            unnamed.append(pair.recording)
+            pattern = ""
+        pattern_of[recording_and_file] = pattern
     if unnamed:
         raise DataError(
             f"data.site: no pattern fits {listed(sorted(unnamed), 3)} of {pairs.source}; add one,"
             " such as '*'"
         )
     for pattern in names:
-        if pattern not in used:
+        if pattern not in pattern_of.values():
+            recordings = {recording for recording, _ in pattern_of}
             raise DataError(
                 f"data.site: '{pattern}' fits no recording or file of {pairs.source}; recordings:"
-                f" {listed(sorted({recording for recording, _ in found}), 5)}"
+                f" {listed(sorted(recordings), 5)}"
             )
+    named = []
+    for pair in pairs:
+        named.append(replace(pair, site=names[pattern_of[pair.recording, pair.site]]))
+    return replace(pairs, pairs=tuple(named))
 
-    def named(pair: Pair) -> Pair:
-        return replace(pair, site=found[pair.recording, pair.site] or "")
 
-    return replace(pairs, pairs=tuple(named(pair) for pair in pairs))
+def _first_that_fits(patterns: Iterable[str], names: Iterable[str]) -> str | None:
+    """Returns the first pattern that fits one of some names; None if none does."""
+    for pattern in patterns:
+        for name in names:
+            if fnmatchcase(name, pattern):
+                return pattern
+    return None
 
 
 def with_vehicles(pairs: PairSet, pattern: str | None) -> PairSet:
@@ -101,10 +113,14 @@ def with_vehicles(pairs: PairSet, pattern: str | None) -> PairSet:
     for pair in pairs:
         match = expression.search(pair.follower_id)
         fits |= match is not None
-        named.append(pair if match is None else replace(pair, vehicle=match[1]))
+        if match is None:
+            named.append(pair)
+        else:
+            named.append(replace(pair, vehicle=match[1]))
     if not fits and len(pairs):
+        ids = {pair.follower_id for pair in pairs}
         raise DataError(
             f"data.vehicle={pattern} fits no follower's id of {pairs.source}; ids there:"
-            f" {listed(sorted({pair.follower_id for pair in pairs}), 5)}"
+            f" {listed(sorted(ids), 5)}"
         )
     return replace(pairs, pairs=tuple(named))

@@ -101,18 +101,21 @@ def _remark_of(statement: Statement) -> Remark | None:
         comparison = _compared(statement.said, follows, statement.resolution)
         if comparison is not None:
             comparisons.append(comparison)
-    if not comparisons or max(one.agree for one in comparisons) >= _MOST:
+    if not comparisons:
+        return None
+    closest = max(comparisons, key=lambda comparison: comparison.agree)
+    if closest.agree >= _MOST:
         return None
     for factor, units in _FACTORS.items():
-        for one in comparisons:
-            is_unit = abs(abs(np.log(one.factor)) - np.log(factor)) < _SAME
-            if is_unit and one.steady >= _MOST:
+        for comparison in comparisons:
+            is_unit = abs(abs(np.log(comparison.factor)) - np.log(factor)) < _SAME
+            if is_unit and comparison.steady >= _MOST:
                 return Remark(
-                    f"{statement.column} is typically {one.factor:.3g} times what follows from"
-                    f" {statement.basis}, as between {units}: the file seems to be in two units",
+                    f"{statement.column} is typically {comparison.factor:.3g} times what follows"
+                    f" from {statement.basis}, as between {units}: the file seems to be in two"
+                    " units",
                     is_contradiction=True,
                 )
-    closest = max(comparisons, key=lambda one: one.agree)
     return Remark(
         f"{statement.column} agrees with {statement.basis} in {closest.agree:.0%} of the rows only,"
         f" and is typically {closest.factor:.3g} times what follows: are both of these vehicles?"

@@ -25,7 +25,7 @@ from pydantic import Field, model_validator
 
 from cfx.core import memory
 from cfx.core.component import Settings
-from cfx.data.pairs import Pair, PairSet
+from cfx.data.pairs import Pair, PairSet, of_each, over_frames
 from cfx.errors import DataError
 
 if TYPE_CHECKING:
@@ -155,7 +155,10 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
     table.insert(1, "score", score)
     table.insert(2, "cluster", cluster)
     table.insert(3, "cluster_name", [CLUSTERS[number] for number in cluster])
-    if any(pair.site for pair in pairs):
+    has_sites = False
+    for pair in pairs:
+        has_sites |= bool(pair.site)
+    if has_sites:
         table["site"], table["driver_type"] = _whereabouts(pairs, table["driver"].tolist())
     by_name = dict(zip(names, weights.tolist(), strict=True))
     return StyleResult(table, by_name, (float(low), float(high)))
@@ -163,12 +166,16 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
 
 def _whereabouts(pairs: PairSet, drivers: Sequence[str]) -> tuple[list[str], list[str]]:
     """Returns the sites and the type of each driver."""
-    sites: dict[str, dict[str, None]] = {}
-    kinds: dict[str, str] = {}
+    sites_of: dict[str, dict[str, None]] = {}
+    type_of: dict[str, str] = {}
     for pair in pairs:
-        sites.setdefault(pair.driver, {})[pair.site] = None
-        kinds[pair.driver] = pair.driver_type
-    return [BETWEEN.join(sites[name]) for name in drivers], [kinds[name] for name in drivers]
+        sites_of.setdefault(pair.driver, {})[pair.site] = None
+        type_of[pair.driver] = pair.driver_type
+    sites, types = [], []
+    for driver in drivers:
+        sites.append(BETWEEN.join(sites_of[driver]))
+        types.append(type_of[driver])
+    return sites, types
 
 
 def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
@@ -183,10 +190,10 @@ def select_cluster(pairs: PairSet, style: StyleResult, cluster: str) -> PairSet:
     chosen = pairs.select([pair.driver in drivers for pair in pairs], f"driver is not {cluster}")
     if not len(chosen):
         sizes = style.table["cluster_name"].value_counts()
-        counted = ", ".join(f"{sizes.get(name, 0)} {name}" for name in CLUSTERS)
+        in_words = ", ".join([f"{sizes.get(name, 0)} {name}" for name in CLUSTERS])
         raise DataError(
             f"style.cluster={cluster}: none of the {len(style.table)} drivers is in this cluster"
-            f" ({counted}); give more pairs, another style.cluster, or"
+            f" ({in_words}); give more pairs, another style.cluster, or"
             " style.percentiles further apart from 0 and 100"
         )
     return chosen
@@ -202,7 +209,9 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
     """
     import pandas as pd
 
-    parts = [_indicators(some) for some in _by_driver(pairs)]
+    parts = []
+    for whole_drivers in _by_driver(pairs):
+        parts.append(_indicators(whole_drivers))
     return pd.concat(parts, ignore_index=True)
 
 
@@ -211,15 +220,16 @@ def _by_driver(pairs: PairSet) -> Iterator[list[Pair]]:
     of_driver: dict[str, list[int]] = {}
     for index, pair in enumerate(pairs.pairs):
         of_driver.setdefault(pair.driver, []).append(index)
-    some: list[Pair] = []
+    part: list[Pair] = []
     for indices in of_driver.values():
-        some += [pairs[index] for index in indices]
-        if len(some) >= _PAIRS_AT_ONCE:
-            yield some
-            some = []
+        for index in indices:
+            part.append(pairs[index])
+        if len(part) >= _PAIRS_AT_ONCE:
+            yield part
+            part = []
             memory.release()
-    if some:
-        yield some
+    if part:
+        yield part
 
 
 def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
@@ -227,11 +237,11 @@ def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
     import pandas as pd
 
     sizes = [len(pair) for pair in pairs]
-    code, drivers = pd.factorize(np.array([pair.driver for pair in pairs], dtype=object))
+    code, drivers = pd.factorize(np.array(of_each(pairs, "driver"), dtype=object))
     code = np.repeat(code, sizes)
-    speed = np.concatenate([pair.follower_speed for pair in pairs])
-    acceleration = np.concatenate([pair.follower_acceleration for pair in pairs])
-    space = np.concatenate([pair.leader_position - pair.follower_position for pair in pairs])
+    speed = over_frames(pairs, "follower_speed")
+    acceleration = over_frames(pairs, "follower_acceleration")
+    space = over_frames(pairs, "leader_position") - over_frames(pairs, "follower_position")
     moving = speed >= STANDING_MPS
     time = np.where(moving, space / np.where(moving, speed, 1.0), 0.0)
 
@@ -349,21 +359,27 @@ def groups(drivers: pd.DataFrame) -> list[Group]:
         drivers: a row per driver, with `site` and `driver_type`, as `StyleResult.table`.
 
     Returns:
-        None where there is one site alone, or where sites are not known.
+        Nothing where there is one site alone, or where sites are not known.
     """
     if "site" not in drivers:
         return []
-    at = [str(names).split(BETWEEN) for names in drivers["site"].fillna("")]
-    sites = dict.fromkeys(name for names in at for name in names if name)
-    kinds = drivers["driver_type"].fillna("").replace("", NOT_KNOWN)
-    found = []
-    for site in sites:
-        here = np.array([site in names for names in at])
-        found.append(Group(site, ALL_TYPES, here))
-        there = dict.fromkeys(kinds[here])
-        if len(there) > 1:
-            found += [Group(site, str(kind), here & (kinds == kind).to_numpy()) for kind in there]
-    return found if len(sites) > 1 else []
+    drivers_at: dict[str, NDArray[np.bool_]] = {}
+    for number, names in enumerate(drivers["site"].fillna("")):
+        for site in str(names).split(BETWEEN):
+            if site:
+                is_there = drivers_at.setdefault(site, np.zeros(len(drivers), dtype=bool))
+                is_there[number] = True
+    if len(drivers_at) < 2:
+        return []
+    types = drivers["driver_type"].fillna("").replace("", NOT_KNOWN)
+    every = []
+    for site, is_there in drivers_at.items():
+        every.append(Group(site, ALL_TYPES, is_there))
+        types_there = types[is_there].unique()
+        if len(types_there) > 1:
+            for kind in types_there:
+                every.append(Group(site, str(kind), is_there & (types == kind).to_numpy()))
+    return every
 
 
 def styles_by_site(style: StyleResult) -> pd.DataFrame | None:
@@ -375,14 +391,14 @@ def styles_by_site(style: StyleResult) -> pd.DataFrame | None:
         `score_q75`, and the median of each indicator under its name (SI units). None where there
         is one site alone.
     """
-    found = groups(style.table)
-    if not found:
+    every = groups(style.table)
+    if not every:
         return None
     import pandas as pd
     from scipy import stats  # slow to import: only where there is something to summarise
 
     rows: list[dict[str, object]] = []
-    for group in found:
+    for group in every:
         table = style.table[group.chosen]
         score = table["score"].to_numpy(dtype=np.float64)
         low = high = float("nan")
@@ -427,12 +443,13 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
     import pandas as pd
     from scipy import stats  # slow to import: only where there is something to compare
 
-    scaled = normalise(style.table[[one.name for one in INDICATORS]].to_numpy(dtype=np.float64))
-    weighted = scaled * np.array([style.weights[one.name] for one in INDICATORS])
+    names = [indicator.name for indicator in INDICATORS]
+    scaled = normalise(style.table[names].to_numpy(dtype=np.float64))
+    weighted = scaled * np.array([style.weights[name] for name in names])
     score = style.table["score"].to_numpy(dtype=np.float64)
     rows: list[dict[str, object]] = []
-    for one, other in compared:
-        first, second = one.chosen & ~other.chosen, other.chosen & ~one.chosen
+    for group, other in compared:
+        first, second = group.chosen & ~other.chosen, other.chosen & ~group.chosen
         if min(first.sum(), second.sum()) < _FEWEST:
             continue
         tested = stats.permutation_test(
@@ -447,7 +464,7 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
             distance = stats.energy_distance(values[first], values[second])
             of_each[f"distance_{indicator.name}"] = float(distance)
         most = max(of_each, key=of_each.__getitem__).removeprefix("distance_")
-        row: dict[str, object] = {"site": one.site, "driver_type": one.driver_type}
+        row: dict[str, object] = {"site": group.site, "driver_type": group.driver_type}
         row |= {"other_site": other.site, "other_driver_type": other.driver_type}
         row |= {"distance": float(tested.statistic), "p_value": float(tested.pvalue), "most": most}
         rows.append(row | of_each)
@@ -460,8 +477,13 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
 
 def _compared(drivers: pd.DataFrame) -> Iterator[tuple[Group, Group]]:
     """Yields each two sites, then each two types of drivers of a site."""
-    every = groups(drivers)
-    yield from combinations([group for group in every if group.driver_type == ALL_TYPES], 2)
-    for one, other in combinations([group for group in every if group.driver_type != ALL_TYPES], 2):
-        if one.site == other.site:
-            yield one, other
+    sites, types = [], []
+    for group in groups(drivers):
+        if group.driver_type == ALL_TYPES:
+            sites.append(group)
+        else:
+            types.append(group)
+    yield from combinations(sites, 2)
+    for first, second in combinations(types, 2):
+        if first.site == second.site:
+            yield first, second

@@ -26,7 +26,16 @@ import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from cfx.data.files import PARQUET, Floats, Ints, first_bytes, open_text, read_head, unpacking
+from cfx.data.files import (
+    PARQUET,
+    Floats,
+    Ints,
+    first_bytes,
+    has_letters,
+    open_text,
+    read_head,
+    unpacking,
+)
 from cfx.data.names import name_of, names_of
 from cfx.errors import DataError, first_line, listed, nearest
 
@@ -40,6 +49,9 @@ _UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
 _ABSENT = ("", "nan", "na", "null", "none", "n/a", "#n/a")
 """Cells that stand for no number, in small letters."""
+
+_CONTROL = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
+"""Bytes below 32 that no text has: all but tab, line feed, form feed and carriage return."""
 
 _PANDAS_INDEX = "__index_level_0__"
 """A column that pandas adds to parquet files for the rows' index; it is not the user's."""
@@ -61,6 +73,7 @@ class FileColumn:
         whole: whether its numbers are whole.
         least: smallest number that is possible.
         above: every number is greater than this.
+        most: largest number that is possible.
         wrong: what is wrong with a number that is not whole or out of bounds, and what to do.
         called: the file's own name of the column, under which alone it is looked for; "": its name.
         factor: what the file's numbers are multiplied by once they are checked.
@@ -77,6 +90,7 @@ class FileColumn:
     whole: bool = False
     least: float = -np.inf
     above: float = -np.inf
+    most: float = np.inf
     wrong: str = ""
     called: str = ""
     factor: float = 1.0
@@ -135,31 +149,37 @@ class Layout:
         for index, name in enumerate(names):
             at.setdefault(name, index)
             plain.setdefault(self.plain(name), index)
-        found: dict[str, _Found] = {}
+        matches: dict[str, _Found] = {}
+        taken: set[int] = set()
         missing = []
         for column in self.columns:
-            own = self._found(column, at, plain)
-            taken = {one.at for one in found.values()}
-            found |= {one.column.name: one for one in own if one.at not in taken}
-            if not own and column.needed and not (column.unless and column.unless in at):
+            own_matches = self._matches(column, at, plain)
+            for match in own_matches:
+                if match.at not in taken:
+                    matches[match.column.name] = match
+            taken.update(match.at for match in own_matches)
+            if not own_matches and column.needed and not (column.unless and column.unless in at):
                 missing.append(column)
-        for one in found.values():
-            name = names[one.at]
+        for match in matches.values():
+            name = names[match.at]
             if names.count(name) > 1:
                 raise DataError(
                     f"{source}: column {name} stands in the file more than once; remove one of them"
                 )
         if missing:
             raise DataError(self._missing(source, missing, names))
-        return found
+        return matches
 
-    def _found(
+    def _matches(
         self, column: FileColumn, at: Mapping[str, int], plain: Mapping[str, int]
     ) -> list[_Found]:
         """Returns where a column is: once, or as often as its pattern matches."""
         if column.many:
-            matching = [name for name in at if re.fullmatch(column.name, name)]
-            return [_Found(replace(column, name=name), at[name]) for name in matching]
+            matches = []
+            for name, place in at.items():
+                if re.fullmatch(column.name, name):
+                    matches.append(_Found(replace(column, name=name), place))
+            return matches
         for name in column.written:
             if name in at:
                 return [_Found(column, at[name])]
@@ -173,22 +193,37 @@ class Layout:
         missing = sorted(missing, key=lambda column: bool(column.unless))
         first = missing[0]
         called = " or ".join(first.written)
-        own = {column.title for column in self.columns}
-        spare = [name for name in names if name not in own]
+        of_layout = {column.title for column in self.columns}
+        spare = []
+        for name in names:
+            if name not in of_layout:
+                spare.append(name)
         where = source
         if self.above:
             where += f", row {self.above + 1}"
         text = f"{where}: column {called} is missing."
         if len(names) > 1:
             text += nearest(first.title, spare)
-        also = [column.title for column in missing[1:] if not column.unless]
+        also = []
+        spared_by: dict[str, list[str]] = {}
+        for column in missing:
+            if column.unless:
+                spared_by.setdefault(column.unless, []).append(column.title)
+            elif column is not first:
+                also.append(column.title)
         if also:
-            text += f" So {'is' if len(also) == 1 else 'are'} {listed(also, 5)}."
-        for unless in dict.fromkeys(column.unless for column in missing if column.unless):
-            spared = [column.title for column in missing if column.unless == unless]
-            text += f" {listed(spared, 10)}: missing too, but not needed beside a column {unless}."
-        hints = dict.fromkeys(self.elsewhere.get(self.plain(name), "") for name in names)
-        text += "".join(f" {hint}" for hint in hints if hint)
+            verb = "are"
+            if len(also) == 1:
+                verb = "is"
+            text += f" So {verb} {listed(also, 5)}."
+        for other, spared in spared_by.items():
+            text += f" {listed(spared, 10)}: missing too, but not needed beside a column {other}."
+        hints: dict[str, None] = {}
+        for name in names:
+            hint = self.elsewhere.get(self.plain(name), "")
+            if hint:
+                hints[f" {hint}"] = None
+        text += "".join(hints)
         return f"{text} Columns found: {listed(names, 30)}."
 
 
@@ -248,19 +283,22 @@ class Table:
         text = f"{self.source}, row {self.row(index)}"
         if column:
             text += f", column {self.title(column)}"
-        known = []
+        identity = []
         for word, key in self.layout.keys.items():
             if key in self.numbers:
-                known.append(f"{word} {self.numbers[key][index]:g}")
+                identity.append(f"{word} {self.numbers[key][index]:g}")
             elif self.labels[key].codes[index] >= 0:
-                known.append(f"{word} '{self.labels[key].at(int(index))}'")
-        if known:
-            text += f" ({', '.join(known)})"
+                identity.append(f"{word} '{self.labels[key].at(int(index))}'")
+        if identity:
+            text += f" ({', '.join(identity)})"
         return text
 
     def title(self, column: str) -> str:
         """Returns what messages call a column."""
-        return next((one.title for one in self.layout.columns if one.name == column), column)
+        for declared in self.layout.columns:
+            if declared.name == column:
+                return declared.title
+        return column
 
     def refuse(self, column: str, wrong: NDArray[bool_], why: str) -> None:
         """Raises DataError if any cell of a column of numbers is wrong; names the first.
@@ -303,17 +341,22 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
     try:
         file = pq.ParquetFile(path)
         stored = file.schema_arrow.names
-        more = {name: value for name, value in (given or {}).items() if name not in stored}
-        found = layout.found_in(str(path), [*stored, *more])
-        wanted = [stored[one.at] for one in found.values() if one.at < len(stored)]
-        columns = file.read(columns=wanted)
+        more = dict(given or {})
+        for name in stored:
+            more.pop(name, None)
+        matches = layout.found_in(str(path), [*stored, *more])
+        used = []
+        for match in matches.values():
+            if match.at < len(stored):
+                used.append(stored[match.at])
+        columns = file.read(columns=used)
         for name, value in more.items():
             columns = columns.append_column(name, pa.array([value] * len(columns)))
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         raise DataError(
             f"{path}: the parquet file is cut off or damaged ({first_line(error)}); write it again"
         ) from None
-    return _checked(_Source(str(path), layout, [*stored, *more], 1), found, columns)
+    return _checked(_Source(str(path), layout, [*stored, *more], 1), matches, columns)
 
 
 def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
@@ -326,21 +369,21 @@ def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
         DataError: as `read_table`; or a column mixes numbers and text.
     """
     names = [str(name) for name in frame.columns]
-    found = layout.found_in(source, names)
-    wanted = frame.set_axis(names, axis=1)[[names[one.at] for one in found.values()]]
-    for one in found.values():
-        cells = wanted[names[one.at]]
+    matches = layout.found_in(source, names)
+    used = frame.set_axis(names, axis=1)[[names[match.at] for match in matches.values()]]
+    for match in matches.values():
+        name = names[match.at]
         # Names may be numbers in some rows and text in others; Arrow wants one type.
-        if one.column.is_name and pd.api.types.infer_dtype(cells).startswith("mixed"):
-            wanted = wanted.assign(**{names[one.at]: names_of(cells)})
+        if match.column.is_name and pd.api.types.infer_dtype(used[name]).startswith("mixed"):
+            used = used.assign(**{name: names_of(used[name])})
     try:
-        columns = pa.Table.from_pandas(wanted, preserve_index=False)
+        columns = pa.Table.from_pandas(used, preserve_index=False)
     except pa.ArrowException as error:
         raise DataError(
             f"{source}: a column mixes numbers and text ({first_line(error)});"
             " give each column one type"
         ) from None
-    return _checked(_Source(source, layout, names, 1), found, columns)
+    return _checked(_Source(source, layout, names, 1), matches, columns)
 
 
 # --- cells ----------------------------------------------------------------------------------------
@@ -355,33 +398,43 @@ class _Source(NamedTuple):
     first_row: int
 
 
-def _checked(source: _Source, found: Mapping[str, _Found], columns: Any) -> Table:
+def _checked(source: _Source, matches: Mapping[str, _Found], columns: Any) -> Table:
     """Returns Arrow columns as a table of numbers and names, in the layout's units."""
-    used = {one.at for one in found.values()}
-    ignored = []
-    for at, name in enumerate(source.columns):
-        if at not in used and name != _PANDAS_INDEX:
-            ignored.append(name if name not in {"", "None"} else f"column {at + 1} without a name")
+    ignored = _ignored(source, matches)
     numbers: dict[str, Floats] = {}
     labels: dict[str, NameColumn] = {}
     table = Table(source.name, source.layout, numbers, labels, source.first_row, ignored)
-    for name, one in found.items():
-        cells = columns.column(source.columns[one.at])
-        if one.column.is_name:
+    for name, match in matches.items():
+        cells = columns.column(source.columns[match.at])
+        if match.column.is_name:
             labels[name] = _labels(table, name, cells)
         else:
             numbers[name] = _floats(table, name, cells)
     if not len(table):
         raise DataError(f"{source.name}: has the right columns but no rows")
-    for name, own in labels.items():
-        if not found[name].column.may_be_empty:
-            _require_names(table, name, own)
+    for name, names in labels.items():
+        if not matches[name].column.may_be_empty:
+            _require_names(table, name, names)
     for name, values in numbers.items():
-        _require_numbers(table, name, values, found[name].column)
-    for name, one in found.items():
-        if one.column.factor != 1.0:
-            numbers[name] = numbers[name] * one.column.factor
+        _require_numbers(table, name, values, matches[name].column)
+    for name, match in matches.items():
+        if match.column.factor != 1.0:
+            numbers[name] = numbers[name] * match.column.factor
     return table
+
+
+def _ignored(source: _Source, matches: Mapping[str, _Found]) -> list[str]:
+    """Returns the names of columns that are not part of the layout."""
+    used = {match.at for match in matches.values()}
+    ignored = []
+    for at, name in enumerate(source.columns):
+        if at in used or name == _PANDAS_INDEX:
+            continue
+        if name in {"", "None"}:
+            ignored.append(f"column {at + 1} without a name")
+        else:
+            ignored.append(name)
+    return ignored
 
 
 def _require_names(table: Table, name: str, labels: NameColumn) -> None:
@@ -400,12 +453,14 @@ def _require_numbers(table: Table, name: str, values: Floats, column: FileColumn
         is_bad = np.isinf(values)
     at = np.flatnonzero(is_bad)
     if len(at):
-        what = "empty or NaN" if np.isnan(values[at[0]]) else "infinite"
+        what = "infinite"
+        if np.isnan(values[at[0]]):
+            what = "empty or NaN"
         raise DataError(
             f"{table.at(at[0], name)}: the cell is {what} ({len(at)} such cells in this column);"
             f" {table.layout.remedy}"
         )
-    wrong = (values < column.least) | (values <= column.above)
+    wrong = (values < column.least) | (values <= column.above) | (values > column.most)
     if column.whole:
         wrong |= (values != np.floor(values)) & ~np.isnan(values)
     table.refuse(name, wrong, column.wrong)
@@ -473,8 +528,8 @@ def _labels(table: Table, name: str, column: Any) -> NameColumn:
     if isinstance(column, pa.ChunkedArray):  # no chunk at all
         return NameColumn(np.zeros(0, np.int64), [])
     written: list[str | None] = []
-    for one in column.dictionary.to_pylist():
-        written.append(name_of(one) or None)
+    for cell in column.dictionary.to_pylist():
+        written.append(name_of(cell) or None)
     merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
     codes = pc.fill_null(column.indices, len(written)).to_numpy(zero_copy_only=False)
     return NameColumn(np.append(merged, -1).astype(np.int64)[codes], list(names))
@@ -515,13 +570,13 @@ class _Text(NamedTuple):
 
 def _read_text(path: Path, layout: Layout) -> Table:
     text = _read_header(path, layout)
-    found = layout.found_in(str(path), text.names)
+    matches = layout.found_in(str(path), text.names)
     try:
-        columns = _parsed(text, found, pa.float64())
+        columns = _parsed(text, matches, pa.float64())
     except pa.ArrowInvalid:
         # Some cell is no plain number: read these columns as text and look closer.
-        columns = _parsed(text, found, pa.string())
-    return _checked(_Source(str(path), layout, text.names, text.skipped + 1), found, columns)
+        columns = _parsed(text, matches, pa.string())
+    return _checked(_Source(str(path), layout, text.names, text.skipped + 1), matches, columns)
 
 
 def _read_header(path: Path, layout: Layout) -> _Text:
@@ -530,18 +585,23 @@ def _read_header(path: Path, layout: Layout) -> _Text:
     if head.startswith(_UTF16):
         raise DataError(f"{path}: is in UTF-16; save it as UTF-8")
     lines = _decoded(path, head).splitlines()[layout.above :]
-    first = next((line for line in lines if line.strip()), "")
+    first = ""
+    for line in lines:
+        if line.strip():
+            first = line
+            break
     if not first:
         raise DataError(f"{path}: the file holds no rows")
     exponents_removed = first.lower().replace("e+", "").replace("e-", "")
-    has_header = any(character.isalpha() for character in exponents_removed)
+    has_header = has_letters(exponents_removed)
     delimiter = " "
     cells = first.split()
-    own = next((separator for separator in layout.separators if separator in first), "")
-    if own:
-        delimiter = own
-        cells = [cell.strip() for cell in next(csv.reader([first], delimiter=own))]
-    else:
+    for separator in layout.separators:
+        if separator in first:
+            delimiter = separator
+            cells = [cell.strip() for cell in next(csv.reader([first], delimiter=separator))]
+            break
+    if delimiter == " ":
         for separator, plural in _OTHER_SEPARATORS.items():
             if separator in first and not (separator == "\t" and not has_header):
                 raise DataError(
@@ -559,12 +619,15 @@ def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, 
     if width in layout.headerless:
         return layout.headerless[width]
     if layout.headerless:
-        widths = " or ".join(str(known) for known in layout.headerless)
+        widths = " or ".join([str(columns) for columns in layout.headerless])
         raise DataError(
             f"{path}: its first row has {width} columns; {layout.name}'s files without a header"
             f" have {widths}"
         )
-    needed = [column.title for column in layout.columns if column.needed and not column.many]
+    needed = []
+    for column in layout.columns:
+        if column.needed and not column.many:
+            needed.append(column.title)
     raise DataError(
         f"{path}: the first row must hold the column names of {layout.name}: {listed(needed, 20)}"
     )
@@ -572,7 +635,7 @@ def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, 
 
 def _decoded(path: Path, head: bytes) -> str:
     """Returns the beginning of a file as text; raises DataError if it is none."""
-    is_binary = any(byte < 32 and byte not in b"\t\n\r\f" for byte in head)
+    is_binary = _CONTROL.search(head) is not None
     try:
         text = head.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -588,7 +651,7 @@ def _decoded(path: Path, head: bytes) -> str:
     return text
 
 
-def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:
+def _parsed(text: _Text, matches: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:
     """Returns the columns found as one Arrow table.
 
     Args:
@@ -604,12 +667,14 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
         broken.append(row)
         return "error"
 
-    parsed_by = "," if text.delimiter == " " else text.delimiter
+    parsed_by = text.delimiter
+    if text.delimiter == " ":
+        parsed_by = ","  # `_Commas` puts them in place of white space
     types = {}
-    for one in found.values():
-        types[f"c{one.at}"] = number_type
-        if one.column.is_name:
-            types[f"c{one.at}"] = pa.dictionary(pa.int32(), pa.string())
+    for match in matches.values():
+        types[f"c{match.at}"] = number_type
+        if match.column.is_name:
+            types[f"c{match.at}"] = pa.dictionary(pa.int32(), pa.string())
     width = len(text.names) + spare
     if spare:
         types[f"c{width - 1}"] = pa.string()
@@ -627,7 +692,9 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
     }
     try:
         with open_text(text.path) as file, unpacking(text.path):
-            source = _Commas(file) if text.delimiter == " " else file
+            source: Any = file
+            if text.delimiter == " ":
+                source = _Commas(file)
             # Not open_csv: after an error its threads may wait for one another when Python exits.
             table = pa.csv.read_csv(source, **options)
     except pa.ArrowInvalid as error:
@@ -635,7 +702,7 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
             row = broken[0]
             more = row.actual_columns - len(text.names)
             if spare == 0 and more == 1 and str(row.text).rstrip().endswith(parsed_by):
-                return _parsed(text, found, number_type, spare=1)
+                return _parsed(text, matches, number_type, spare=1)
             raise DataError(
                 f"{text.path}, row {row.number}: {row.actual_columns} columns instead of"
                 f" {width}; is the file cut off there, or does a cell hold a separator?"
@@ -644,14 +711,13 @@ def _parsed(text: _Text, found: Mapping[str, _Found], number_type: Any, spare: i
             raise DataError(f"{text.path}: cannot be read as a table ({error})") from None
         raise
     if spare:
-        nameless = table.column(f"c{width - 1}").to_pylist()
-        row = next((at for at, cell in enumerate(nameless) if cell and cell.strip()), None)
-        if row is not None:
-            raise DataError(
-                f"{text.path}, row {row + text.skipped + 1}: '{nameless[row]}' stands behind the"
-                f" last of {len(text.names)} columns; does a cell hold a separator?"
-            )
-    kept = {f"c{one.at}": text.names[one.at] for one in found.values()}
+        for row, cell in enumerate(table.column(f"c{width - 1}").to_pylist()):
+            if cell and cell.strip():
+                raise DataError(
+                    f"{text.path}, row {row + text.skipped + 1}: '{cell}' stands behind the"
+                    f" last of {len(text.names)} columns; does a cell hold a separator?"
+                )
+    kept = {f"c{match.at}": text.names[match.at] for match in matches.values()}
     return table.select(list(kept)).rename_columns(list(kept.values()))
 
 
@@ -669,7 +735,7 @@ class _Commas(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         if not self._ready:
             lines = b"".join(self._file.readlines(_BLOCK)).splitlines()
-            self._ready = b"".join(b",".join(line.split()) + b"\n" for line in lines)
+            self._ready = b"".join([b",".join(line.split()) + b"\n" for line in lines])
         size = min(len(buffer), len(self._ready))
         buffer[:size] = self._ready[:size]
         self._ready = self._ready[size:]

@@ -17,6 +17,7 @@ One row per pair and frame, SI units, a constant time step within a pair, no gap
 | `site` | | optional: the road or area of a recording; several recordings may share one |
 | `vehicle` | | optional: the follower's name over all recordings, where it has one |
 | `lane` | | optional, one value for each pair |
+| further signals | as declared | optional: what inputs of policies read (`data.inputs`) |
 | `true_model`, `true_NAME` | | optional: a synthetic driver's model and its parameters over time |
 
 Without `recording` a file is one, without `follower_id` each pair is a driver of its own, without
@@ -31,7 +32,7 @@ A length of 0 says that the leader's position is that of its rear bumper. See
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from fractions import Fraction
@@ -47,7 +48,7 @@ from pydantic import AfterValidator, Field, model_validator
 from pydantic_core import PydanticCustomError
 
 from cfx.core import memory
-from cfx.core.component import Settings
+from cfx.core.component import Distinct, Settings
 from cfx.core.files import atomic_write
 from cfx.data.base import Contents, Dataset, FileDatasetSettings, joined
 from cfx.data.files import (
@@ -61,7 +62,8 @@ from cfx.data.files import (
     partitions,
     recording_of,
 )
-from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.pairs import Dropped, Pair, PairSet, of_each
+from cfx.data.signals import RECORDED, SIGNALS, Signal, declared_by, further_signals
 from cfx.data.table import FileColumn, Layout, Table, read_table, table_of
 from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, check_gap, time_steps
 from cfx.data.units import factor
@@ -69,16 +71,6 @@ from cfx.errors import OutputError, listed
 
 LABELS = ("recording", "pair_id", "leader_id", "follower_id")
 """Columns of names that every pair has."""
-
-SIGNAL_COLUMNS = {
-    "leader_position": "leader_position_m",
-    "leader_speed": "leader_speed_mps",
-    "leader_acceleration": "leader_acceleration_mps2",
-    "follower_position": "follower_position_m",
-    "follower_speed": "follower_speed_mps",
-    "follower_acceleration": "follower_acceleration_mps2",
-}
-"""A pair's signals, and the columns that they are written in."""
 
 OPTIONAL_LABELS = {
     "true_model": "truth_model",
@@ -88,6 +80,15 @@ OPTIONAL_LABELS = {
     "vehicle": "vehicle",
 }
 """Columns of names that some files have, and the attributes of pairs that they hold."""
+
+
+def _column_of(name: str) -> FileColumn:
+    """Returns the column of a signal of every recording; beside gaps some may be left out."""
+    signal = SIGNALS[name]
+    if signal.quantity == "speed":
+        return FileColumn(signal.column, signal.unit, least=signal.low, wrong=_REVERSING)
+    return FileColumn(signal.column, signal.unit, unless=GAP)
+
 
 _NGSIM = "This looks like an NGSIM file: use data=ngsim."
 _REVERSING = "is negative; speeds count along the lane and must be 0 or more"
@@ -103,12 +104,7 @@ LAYOUT = Layout(
             wrong="is no whole number; number the frames 0, 1, 2, ...",
         ),
         FileColumn("time_s", "s"),
-        FileColumn("leader_position_m", "m", unless=GAP),
-        FileColumn("leader_speed_mps", "m/s", least=0, wrong=_REVERSING),
-        FileColumn("leader_acceleration_mps2", "m/s2", unless=GAP),
-        FileColumn("follower_position_m", "m", unless=GAP),
-        FileColumn("follower_speed_mps", "m/s", least=0, wrong=_REVERSING),
-        FileColumn("follower_acceleration_mps2", "m/s2", unless=GAP),
+        *[_column_of(name) for name in RECORDED],
         FileColumn(
             LENGTH,
             "m",
@@ -138,12 +134,12 @@ COLUMNS = {
     "follower_id": "follower_id",
     "frame": "frame",
     "time": "time_s",
-    "position": "follower_position_m",
-    "speed": "follower_speed_mps",
-    "acceleration": "follower_acceleration_mps2",
-    "leader_position": "leader_position_m",
-    "leader_speed": "leader_speed_mps",
-    "leader_acceleration": "leader_acceleration_mps2",
+    "position": SIGNALS["follower_position"].column,
+    "speed": SIGNALS["follower_speed"].column,
+    "acceleration": SIGNALS["follower_acceleration"].column,
+    "leader_position": SIGNALS["leader_position"].column,
+    "leader_speed": SIGNALS["leader_speed"].column,
+    "leader_acceleration": SIGNALS["leader_acceleration"].column,
     "leader_length": LENGTH,
     "gap": GAP,
     "lane": LANE,
@@ -227,6 +223,11 @@ class TidySettings(FileDatasetSettings):
         OwnUnits(),
         description="the units of columns that are named above, such as units.speed=km/h",
     )
+    inputs: Distinct[tuple[str, ...]] = Field(
+        (),
+        description="inputs of policies whose further signals are read from columns of the file,"
+        " such as [rain]; a job adds those of policy.inputs",
+    )
 
     @model_validator(mode="after")
     def _columns_and_units_agree(self) -> TidySettings:
@@ -254,9 +255,24 @@ class TidySettings(FileDatasetSettings):
                     f" and {quantity}; name another one"
                 )
             seen[column.title] = quantity
-        gap = by_name[GAP].title
-        columns = [replace(one, unless=gap if one.unless else "") for one in by_name.values()]
+        columns = []
+        for column in by_name.values():
+            unless = ""
+            if column.unless:
+                unless = by_name[GAP].title
+            columns.append(replace(column, unless=unless))
         return replace(LAYOUT, columns=tuple(columns))
+
+    def further_signals(self) -> tuple[Signal, ...]:
+        """Returns the signals that `inputs` read beyond those of every recording.
+
+        Raises:
+            PluginError: there is no such input, or two declare a signal in different ways.
+        """
+        signals: list[Signal] = []
+        for name in self.inputs:
+            signals += declared_by(name)
+        return further_signals(signals)
 
     def unit_of(self, name: str) -> str | None:
         """Returns the unit that the file has for a quantity in place of the layout's; or None."""
@@ -269,7 +285,9 @@ class TidySettings(FileDatasetSettings):
         """Returns a column with the name and the unit that the file has for it."""
         called = getattr(self.columns, name)
         if called is not None:
-            scale = factor(self.unit_of(name) or column.unit, column.unit) if column.unit else 1.0
+            scale = 1.0
+            if column.unit:
+                scale = factor(self.unit_of(name) or column.unit, column.unit)
             return replace(column, called=called, factor=scale, needed=True, unless="")
         unit = getattr(self.units, name, None)
         if unit is not None and factor(unit, column.unit) != 1.0:
@@ -303,14 +321,19 @@ class TidyDataset(Dataset):
     def recognises(cls, start: FileStart) -> bool:
         if are_partitions(start.path):
             return True
-        known = {column.name for column in LAYOUT.columns if column.needed}
+        needed = set()
+        for column in LAYOUT.columns:
+            if column.needed:
+                needed.add(column.name)
         if start.magic == PARQUET and not start.columns:
             return True  # a damaged one: the reader says so
-        return len(known & set(start.columns)) >= 3
+        return len(needed & set(start.columns)) >= 3
 
     def contents(self) -> Contents:
-        own = self.settings.columns.gap or GAP
-        has_gaps = all(own in beginning(file).columns for file in self._files())
+        gap = self.settings.columns.gap or GAP
+        has_gaps = True
+        for file in self._files():
+            has_gaps &= gap in beginning(file).columns
         return super().contents()._replace(has_gaps=has_gaps)
 
     def _files(self) -> list[Path]:
@@ -322,40 +345,69 @@ class TidyDataset(Dataset):
 
     def read(self) -> PairSet:
         layout = self.settings.own_layout()
-        return joined(read_tidy(file, layout) for file in self._files())
+        signals = self.settings.further_signals()
+        return joined(read_tidy(file, layout, signals) for file in self._files())
 
     def units(self) -> Mapping[str, str]:
-        units = {name: self.settings.unit_of(name) for name in OwnUnits.model_fields}
-        return {name: unit for name, unit in units.items() if unit}
+        units = {}
+        for name in OwnUnits.model_fields:
+            unit = self.settings.unit_of(name)
+            if unit:
+                units[name] = unit
+        return units
 
 
-def read_tidy(path: Path, layout: Layout = LAYOUT) -> PairSet:
+def read_tidy(path: Path, layout: Layout = LAYOUT, signals: Sequence[Signal] = ()) -> PairSet:
     """Reads a tidy file.
 
     Args:
         layout: the tidy layout, perhaps with the file's own names and units.
+        signals: further ones that are read too.
 
     Raises:
         DataError: the file cannot be read or does not keep to the layout.
     """
     recording = recording_of(path)
-    given = {} if recording is None else {"recording": recording}
-    return _pairs(read_table(path, layout, given))
+    given = {}
+    if recording is not None:
+        given["recording"] = recording
+    return _pairs(read_table(path, _with_signals(layout, signals), given), signals)
 
 
 def pairs_from_frame(
-    frame: pd.DataFrame, source: str = "table", layout: Layout = LAYOUT
+    frame: pd.DataFrame,
+    source: str = "table",
+    layout: Layout = LAYOUT,
+    signals: Sequence[Signal] = (),
 ) -> PairSet:
     """Takes pairs from a table in the tidy layout.
 
     Args:
         source: what messages call the table; its rows are counted from 1.
         layout: the tidy layout, perhaps with the table's own names and units.
+        signals: further ones that are taken too.
 
     Raises:
         DataError: the table does not keep to the layout.
     """
-    return _pairs(table_of(frame, layout, source))
+    return _pairs(table_of(frame, _with_signals(layout, signals), source), signals)
+
+
+def _with_signals(layout: Layout, signals: Sequence[Signal]) -> Layout:
+    """Returns a layout that has the columns of further signals too."""
+    columns = list(layout.columns)
+    for signal in signals:
+        bounds = f"{signal.low:g} to {signal.high:g} {signal.unit}".rstrip()
+        columns.append(
+            FileColumn(
+                signal.column,
+                signal.unit,
+                least=signal.low,
+                most=signal.high,
+                wrong=f"is no possible {signal.meaning}, which is {bounds}",
+            )
+        )
+    return replace(layout, columns=tuple(columns))
 
 
 def row_order(frame: pd.DataFrame) -> Ints:
@@ -371,19 +423,25 @@ def row_order(frame: pd.DataFrame) -> Ints:
     return np.lexsort((time, table.labels["pair_id"].codes))
 
 
-def _pairs(table: Table) -> PairSet:
+def _pairs(table: Table, signals: Sequence[Signal]) -> PairSet:
     table, order, starts = check(table)
     dropped: tuple[Dropped, ...] = ()
     if table.ignored:
         reason = f"not part of the layout: {listed(table.ignored)}"
         dropped = (Dropped(reason, len(table.ignored), "columns"),)
-    pairs = tuple(_build(table, order, starts))
+    pairs = tuple(_build(table, order, starts, signals))
     check_gap(table, pairs)
     return PairSet(pairs, table.source, dropped)
 
 
-def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:
-    """Returns the pairs of a table that was checked; as `check` orders them."""
+def _build(table: Table, order: Ints, starts: Ints, signals: Sequence[Signal]) -> list[Pair]:
+    """Returns the pairs of a table as `check` orders them.
+
+    Args:
+        table: that was checked.
+        order, starts: as `check` gives them.
+        signals: further ones that the pairs shall have.
+    """
     numbers = {name: values[order] for name, values in table.numbers.items()}
     steps = time_steps(numbers["time_s"], starts)
     ends = np.append(starts[1:], len(order))
@@ -400,8 +458,11 @@ def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:
         fields: dict[str, Any] = {name: label[name] for name in LABELS}
         for name, attribute in OPTIONAL_LABELS.items():
             fields[attribute] = label.get(name, "")
-        for signal, column in SIGNAL_COLUMNS.items():
-            fields[signal] = numbers[column][start:end]
+        for name in RECORDED:
+            fields[name] = numbers[SIGNALS[name].column][start:end]
+        surroundings = {}
+        for signal in signals:
+            surroundings[signal] = numbers[signal.column][start:end]
         pair = Pair(
             **fields,
             first_frame=int(numbers["frame"][start]),
@@ -409,6 +470,7 @@ def _build(table: Table, order: Ints, starts: Ints) -> list[Pair]:
             leader_length=float(numbers[LENGTH][start]),
             lane=lane,
             truth=truth,
+            surroundings=surroundings,
         )
         pairs.append(pair)
     return pairs
@@ -488,47 +550,56 @@ def _write(tables: Iterator[Any], temporary: Path, name: str) -> None:
 
 def _tables(pairs: PairSet) -> Iterator[Any]:
     """Yields pairs as Arrow tables in the tidy layout, some pairs after the other; one at least."""
-    optional = []
-    if any(pair.lane is not None for pair in pairs.pairs):
-        optional.append(LANE)
-    for name, attribute in OPTIONAL_LABELS.items():
-        if any(getattr(pair, attribute) for pair in pairs.pairs):
-            optional.append(name)
-    truths = _truth_names(pairs)
+    optional = set()
+    for pair in pairs.pairs:
+        if pair.lane is not None:
+            optional.add(LANE)
+        for name, attribute in OPTIONAL_LABELS.items():
+            if getattr(pair, attribute):
+                optional.add(name)
+    truths, signals = _truth_names(pairs), pairs.surroundings
     for start in range(0, max(1, len(pairs)), _PAIRS_AT_ONCE):
-        yield _as_table(pairs[start : start + _PAIRS_AT_ONCE], optional, truths)
+        yield _as_table(pairs[start : start + _PAIRS_AT_ONCE], optional, truths, signals)
         memory.release()
 
 
-def _as_table(pairs: Sequence[Pair], optional: Sequence[str], truths: Sequence[str]) -> Any:
-    """Returns pairs as an Arrow table with some of the optional columns."""
+def _as_table(
+    pairs: Sequence[Pair],
+    optional: Collection[str],
+    truths: Sequence[str],
+    signals: Sequence[Signal],
+) -> Any:
+    """Returns pairs as an Arrow table with some of the optional columns and further signals."""
     sizes = [len(pair) for pair in pairs]
     pair_of_row = pa.array(np.repeat(np.arange(len(sizes)), sizes))
 
     def per_pair(values: Sequence[Any], kind: Any) -> Any:
         return pa.array(values, kind).take(pair_of_row)
 
-    frames = [pair.first_frame + np.arange(len(pair)) for pair in pairs]
-    times = []
-    for frame, pair in zip(frames, pairs, strict=True):
+    frames, times = [], []
+    for pair in pairs:
+        frame = pair.first_frame + np.arange(len(pair))
+        frames.append(frame)
         times.append(np.asarray(frame * pair.dt, np.float64))
 
     columns: dict[str, Any] = {}
     for name in LABELS:
-        columns[name] = per_pair([getattr(pair, name) for pair in pairs], pa.string())
+        columns[name] = per_pair(of_each(pairs, name), pa.string())
     columns["frame"] = pa.array(np.concatenate([np.zeros(0, np.int64), *frames]), pa.int64())
     columns["time_s"] = _over_time(times)
-    for signal, column in SIGNAL_COLUMNS.items():
-        columns[column] = _over_time([getattr(pair, signal) for pair in pairs])
-    columns[LENGTH] = per_pair([pair.leader_length for pair in pairs], pa.float64())
+    for name in RECORDED:
+        columns[SIGNALS[name].column] = _over_time(of_each(pairs, name))
+    columns[LENGTH] = per_pair(of_each(pairs, "leader_length"), pa.float64())
     if LANE in optional:
-        columns[LANE] = per_pair([pair.lane for pair in pairs], pa.int64())
+        columns[LANE] = per_pair(of_each(pairs, "lane"), pa.int64())
     for name, attribute in OPTIONAL_LABELS.items():
         if name in optional:
-            columns[name] = per_pair([getattr(pair, attribute) for pair in pairs], pa.string())
+            columns[name] = per_pair(of_each(pairs, attribute), pa.string())
     for name in truths:
         values = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
         columns[TRUE + name] = _over_time(values)
+    for signal in signals:
+        columns[signal.column] = _over_time([pair.surroundings[signal] for pair in pairs])
     return pa.table(columns)
 
 

@@ -18,7 +18,7 @@ from cfx.data.files import Floats, Ints
 from cfx.data.kinematics import contradiction
 from cfx.data.pairs import Pair
 from cfx.data.table import NameColumn, Table
-from cfx.data.tracks import accelerations, driven
+from cfx.data.tracks import accelerations, distance_driven
 from cfx.errors import DataError
 
 log = logging.getLogger(__name__)
@@ -237,7 +237,7 @@ def with_positions(table: Table, order: Ints, starts: Ints) -> Table:
         if "follower_position_m" in numbers:
             rear = numbers["follower_position_m"] + gap
         else:
-            rear = _by_pair(driven, numbers["leader_speed_mps"], order, starts, steps)
+            rear = _by_pair(distance_driven, numbers["leader_speed_mps"], order, starts, steps)
         numbers["leader_position_m"] = rear + numbers[LENGTH]
     rear = numbers["leader_position_m"] - numbers[LENGTH]
     if "follower_position_m" not in numbers:

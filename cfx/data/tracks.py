@@ -20,13 +20,13 @@ __all__ = [
     "Marks",
     "accelerations",
     "changes",
-    "counted",
-    "driven",
-    "first_of",
+    "count_reasons",
+    "distance_driven",
+    "first_that_holds",
     "next_in_lane",
     "rows_ahead",
     "runs",
-    "summed",
+    "totals_by_reason",
     "unique_name",
     "vehicles_apart",
 ]
@@ -172,8 +172,8 @@ def extract_pairs(tracks: Tracks, *, max_gap: float | None = None) -> PairSet:
     return PairSet(
         tuple(_build(follower, leader, facts.gap[rows], starts, sizes)),
         tracks.source,
-        (*tracks.dropped, *counted(reasons, "rows")),
-        counted(_ends(tracks, facts, rows[starts + sizes - 1]), "pairs"),
+        (*tracks.dropped, *count_reasons(reasons, "rows")),
+        count_reasons(_ends(tracks, facts, rows[starts + sizes - 1]), "pairs"),
         tracks.remarks,
     )
 
@@ -271,30 +271,37 @@ def _names_apart(
     order = 1
     for row in np.flatnonzero(begins | is_again).tolist():
         name = tracks.name(int(tracks.vehicle[row]))
-        order = order + 1 if is_again[row] else 1
+        order += 1
+        if not is_again[row]:
+            order = 1
         if order == 2:
             twice.append(name)
-        names.append(f"{name}-vehicle{order}" if order > 1 else name)
+        if order > 1:
+            name = f"{name}-vehicle{order}"
+        names.append(name)
     return (*names, ""), twice
 
 
-def counted(reasons: Mapping[str, Marks], unit: str) -> tuple[Dropped, ...]:
+def count_reasons(reasons: Mapping[str, Marks], unit: str) -> tuple[Dropped, ...]:
     """Returns how often each reason holds; reasons that never hold are left out."""
-    found = []
+    counts = []
     for reason, holds in reasons.items():
         count = int(np.count_nonzero(holds))
         if count:
-            found.append(Dropped(reason, count, unit))
-    return tuple(found)
+            counts.append(Dropped(reason, count, unit))
+    return tuple(counts)
 
 
-def summed(counts: Sequence[Dropped]) -> tuple[Dropped, ...]:
+def totals_by_reason(counts: Sequence[Dropped]) -> tuple[Dropped, ...]:
     """Returns one count for each reason, in the order in which they first come."""
     sums: dict[tuple[str, str], int] = {}
-    for one in counts:
-        key = (one.reason, one.unit)
-        sums[key] = sums.get(key, 0) + one.count
-    return tuple(Dropped(reason, count, unit) for (reason, unit), count in sums.items())
+    for dropped in counts:
+        key = (dropped.reason, dropped.unit)
+        sums[key] = sums.get(key, 0) + dropped.count
+    totals = []
+    for (reason, unit), count in sums.items():
+        totals.append(Dropped(reason, count, unit))
+    return tuple(totals)
 
 
 def changes(*keys: NDArray[Any]) -> Marks:
@@ -400,14 +407,14 @@ def _rows_of(tracks: Tracks, recording: Ints, vehicle: Ints, frame: Ints) -> tup
     first = int(min(tracks.frame.min(), frame.min()))
     frames = int(max(tracks.frame.max(), frame.max())) - first + 1
     _, ids = np.unique(np.concatenate([tracks.vehicle, vehicle]), return_inverse=True)
-    known, wanted = ids[: len(tracks)], ids[len(tracks) :]
+    of_rows, sought = ids[: len(tracks)], ids[len(tracks) :]
     vehicles = int(ids.max()) + 1
     # One number for each recording, vehicle and frame; sorted, as the rows are.
-    keys = (tracks.recording * vehicles + known) * frames + tracks.frame - first
-    asked = (recording * vehicles + wanted) * frames + frame - first
-    at = np.searchsorted(keys, asked)
+    keys = (tracks.recording * vehicles + of_rows) * frames + tracks.frame - first
+    sought_keys = (recording * vehicles + sought) * frames + frame - first
+    at = np.searchsorted(keys, sought_keys)
     at[at == len(keys)] = 0
-    has_row = (keys[at] == asked) & (vehicle != NOBODY)
+    has_row = (keys[at] == sought_keys) & (vehicle != NOBODY)
     return np.where(has_row, at, 0), has_row
 
 
@@ -438,10 +445,10 @@ def _ends(tracks: Tracks, facts: _Facts, last: Ints) -> dict[str, Marks]:
         f"the leader went farther than {facts.max_gap:g} m": facts.is_far[after],
         "the recording names no leader any more": np.ones(len(last), dtype=bool),
     }
-    return first_of(reasons)
+    return first_that_holds(reasons)
 
 
-def first_of(reasons: Mapping[str, Marks]) -> dict[str, Marks]:
+def first_that_holds(reasons: Mapping[str, Marks]) -> dict[str, Marks]:
     """Returns the same reasons; each row has only the first that holds for it."""
     result = {}
     is_open: Marks | None = None
@@ -499,7 +506,7 @@ def unique_name(name: str, seen: dict[str, int]) -> str:
     return name
 
 
-def driven(speed: Floats, dt: float) -> Floats:
+def distance_driven(speed: Floats, dt: float) -> Floats:
     """Returns the distance driven since the first frame, `(T,)`, m.
 
     As everywhere in cfx, a vehicle moves by its new speed in each step.

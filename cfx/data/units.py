@@ -29,12 +29,12 @@ def factor(unit: str, si: str) -> float:
     registry = _registry()
     advice = f"write for instance {EXAMPLES[si]}"
     try:
-        known = registry.parse_units(unit)
+        parsed = registry.parse_units(unit)
     except Exception:  # what is no unit raises errors of Python's tokenizer and of pint's parser
         raise ValueError(f"there is no unit '{unit}'; {advice}") from None
-    if known.dimensionality != registry.parse_units(si).dimensionality:
+    if parsed.dimensionality != registry.parse_units(si).dimensionality:
         raise ValueError(f"'{unit}' cannot be turned into {si}; {advice}")
-    return float(registry.Quantity(Fraction(1), known).to(si).magnitude)
+    return float(registry.Quantity(Fraction(1), parsed).to(si).magnitude)
 
 
 def length_mm(text: str) -> float:

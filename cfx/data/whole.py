@@ -108,5 +108,5 @@ def _own_speeds(tracks: Tracks) -> Floats:
     order = np.lexsort((tracks.speed, stint))
     starts, sizes = runs(stint)
     at = starts + (_OWN * (sizes - 1)).astype(np.int64)
-    own: Floats = tracks.speed[order][at][stint]
-    return own
+    speeds: Floats = tracks.speed[order][at][stint]
+    return speeds

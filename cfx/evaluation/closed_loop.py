@@ -26,7 +26,8 @@ from cfx.models.composed import Combined, for_both
 from cfx.models.limits import at_limits
 from cfx.policies.agent import Agent, AgentState, TrainedOn
 from cfx.policies.context import DriverContext
-from cfx.policies.features import History
+from cfx.policies.history import History
+from cfx.policies.known_drivers import driver_features_of
 from cfx.policies.valid_range import share_in_words
 from cfx.simulation.base import Stepper
 from cfx.simulation.trajectory import Start
@@ -129,14 +130,14 @@ def simulate_closed_loop(
     track = _Track(followers.batch, first, agent.windows.length)
     position, speed, acceleration = track.now()
     follower = simulator.begin(Start(position, speed, acceleration))
-    width = len(agent.model_space)
+    width = len(agent.core.head.model_space)
     parameters = track.speed.new_empty((len(first), track.steps + 1, width))
     outside = torch.zeros(parameters.shape[:2], dtype=torch.bool, device=parameters.device)
     beyond = torch.zeros(state.beyond.shape[1], dtype=torch.float64, device=parameters.device)
     _, _, counted = track.result()
     own: Mapping[str, Tensor] = {}
     if followers.own is not None:
-        own = agent.space.unpack(agent.head.completed(followers.own.values))
+        own = agent.space.unpack(agent.core.head.completed(followers.own.values))
     for begin in range(0, track.steps, agent.windows.stride):
         end = min(begin + agent.windows.stride, track.steps)
         chosen, state = agent.act(track.history(begin), state, generator)
@@ -168,7 +169,7 @@ def burnt_in(agent: Agent, followers: Followers, first: Tensor, dt: float) -> Ag
     since = None
     if followers.history is not None:
         since = (first - round(followers.history / dt)).clamp(min=0)
-    features = agent.driver_features_of(followers.batch, first, since)
+    features = driver_features_of(agent, followers.batch, first, since)
     state = agent.begin(followers.network, DriverContext(followers.base, features))
     return agent.burn_in(followers.batch, first, state, since)
 
@@ -195,6 +196,9 @@ class _Track:
             batch.leader_acceleration.gather(1, index),
             batch.leader_length[:, None],
         )
+        self._surroundings = {}
+        for declared, stored in batch.surroundings.items():
+            self._surroundings[declared] = stored.gather(1, index)
         self._position = batch.follower_position.gather(1, index)
         self.speed = batch.follower_speed.gather(1, index)
         self._acceleration = batch.follower_acceleration.gather(1, index)
@@ -215,13 +219,17 @@ class _Track:
     def history(self, begin: int) -> History:
         """Returns the L frames up to step `begin`, `(P, L)` each."""
         recent = slice(begin, begin + self._length)
-        return History(
-            self._leader.speed[:, recent],
-            self._leader.acceleration[:, recent],
-            self.speed[:, recent],
-            self._acceleration[:, recent],
-            self._gap[:, recent],
-        )
+        history = {
+            "leader_speed": self._leader.speed[:, recent],
+            "leader_acceleration": self._leader.acceleration[:, recent],
+            "follower_speed": self.speed[:, recent],
+            "follower_acceleration": self._acceleration[:, recent],
+            "gap": self._gap[:, recent],
+        }
+        for signal, stored in self._surroundings.items():
+            seen = signal.seen_from(self._position[:, recent], stored[:, recent])
+            history[signal.name] = seen
+        return history
 
     def leader(self, begin: int, end: int) -> Leader:
         """Returns the leaders at steps `begin` to `end - 1`, time first."""

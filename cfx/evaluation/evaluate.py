@@ -166,7 +166,6 @@ def evaluate(
     scopes: Mapping[str, Mapping[str, ClosedLoop]],
     space: ParameterSpace,
     *,
-    seed: int,
     policy_space: ParameterSpace | None = None,
     metrics: MetricSet | None = None,
 ) -> Evaluation:
@@ -178,7 +177,6 @@ def evaluate(
             `policy` are among them. `full_trajectory`, if there: from frame 0 on, of methods that
             nothing of these drivers went into.
         space: the model's parameters, in the bounds of constant ones.
-        seed: of the bootstrap.
         policy_space: the parameters in the bounds of `policy`; None: the same bounds.
         metrics: what is measured; None: cfx's own metrics.
 
@@ -200,9 +198,9 @@ def evaluate(
     values = long_table([pair.pair_id for pair in pairs], drivers, measured)
     improvements = {}
     for scope in ("test", "steady", "full_trajectory"):
-        found = _improvements(values, scope, drivers, seed)
-        if found:
-            improvements[scope] = found
+        of_scope = _improvements(values, scope, drivers)
+        if of_scope:
+            improvements[scope] = of_scope
     simulated = SimulatedPairs(pairs, batch, first, loops)
     return Evaluation(
         about=_about(tested, measures, space.names),
@@ -342,44 +340,21 @@ def _values(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]
     return found
 
 
-class _Improvements(Mapping[str, Improvement]):
-    """The policy's improvement over every other method, each computed when it is asked for.
-
-    A calibration asks for none: resampling, and importing what resamples, takes a second or two.
-    `speed` has a column per method and a row per pair: RMSE of speed, m/s.
-    """
-
-    def __init__(self, speed: pd.DataFrame, drivers: Sequence[str], seed: int) -> None:
-        self._speed, self._drivers, self._seed = speed, drivers, seed
-        self._over = tuple(name for name in METHODS if name in speed and name != "policy")
-        self._known: dict[str, Improvement] = {}
-
-    def __getitem__(self, method: str) -> Improvement:
-        if method not in self._over:
-            raise KeyError(method)
-        if method not in self._known:
-            before, policy = (self._speed[name].to_numpy() for name in (method, "policy"))
-            found = improvement_statistics(before, policy, self._drivers, seed=self._seed)
-            self._known[method] = found
-        return self._known[method]
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._over)
-
-    def __len__(self) -> int:
-        return len(self._over)
-
-
 def _improvements(
-    values: pd.DataFrame, scope: str, drivers: Sequence[str], seed: int
-) -> Mapping[str, Improvement]:
+    values: pd.DataFrame, scope: str, drivers: Sequence[str]
+) -> dict[str, Improvement]:
     """Returns the policy's improvement over every other method; empty if it was not simulated."""
     speed = values_of(values, "rmse_speed", scope)
     if "policy" not in speed:
         return {}
-    if scope == "steady" and not np.isfinite(speed["policy"].to_numpy()).any():
+    policy = speed["policy"].to_numpy()
+    if scope == "steady" and not np.isfinite(policy).any():
         return {}
-    return _Improvements(speed, drivers, seed)
+    improvements = {}
+    for method in METHODS:
+        if method in speed and method != "policy":
+            improvements[method] = improvement_statistics(speed[method].to_numpy(), policy, drivers)
+    return improvements
 
 
 def _about(tested: ComparedPairs, measures: _Measures, names: Sequence[str]) -> pd.DataFrame:

@@ -19,11 +19,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import RECORDED
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.context import DriverContext
-from cfx.policies.features import measured_history
+from cfx.policies.history import measured_history
 from cfx.simulation.base import Stepper
 
 __all__ = [
@@ -212,8 +213,8 @@ def _begun(agent: Agent, followers: Followers, pairs: Tensor) -> AgentState:
 def _chunks(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origins]:
     """Cuts origins into parts whose signals and states fit the memory."""
     frames = batch.mask.shape[1]
-    per_origin = _COPIES * (len(SIGNALS) + 2) * frames
-    states = agent.network.initial_state(len(agent.names), 1)
+    per_origin = _COPIES * (len(RECORDED) + len(batch.surroundings) + 2) * frames
+    states = agent.core.network.initial_state(len(agent.names), 1)
     per_origin += _COPIES * math.prod(states.shape[2:])
     size = max(1, _CHUNK_BYTES // (8 * per_origin))
     for first in range(0, len(origins), size):
@@ -240,8 +241,19 @@ def _with_future(batch: PairBatch, origin: Tensor, steps: int, leader: LeaderFut
     position = batch.leader_position[rows, origin][:, None] + ahead.travelled.gather(1, step)
     speeds = ahead.speed.gather(1, step)
     known = after <= 0
+    surroundings = {}
+    for signal, values in batch.surroundings.items():
+        # As for the leader, nothing is known of the future: what is ahead goes on as the leader is
+        # expected to, and everything else stays as it is.
+        expected = values[rows, origin][:, None].expand_as(values)
+        if signal.quantity == "gap":
+            expected = expected + ahead.travelled.gather(1, step)
+        elif signal.quantity == "acceleration":
+            expected = torch.zeros_like(values)
+        surroundings[signal] = torch.where(known, values, expected)
     return replace(
         lasting,
+        surroundings=surroundings,
         leader_position=torch.where(known, batch.leader_position, position),
         leader_speed=torch.where(known, batch.leader_speed, speeds),
         leader_acceleration=torch.where(

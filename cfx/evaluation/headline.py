@@ -9,9 +9,7 @@ from typing import NamedTuple
 from cfx.evaluation.metrics.base import key_of
 
 __all__ = [
-    "Comparison",
-    "contradiction",
-    "opposite",
+    "summaries_disagree",
 ]
 """What plugins may use, as `cfx.plugin.headline`."""
 
@@ -65,16 +63,9 @@ def main_comparison(metrics: Mapping[str, float]) -> Comparison | None:
     Where there are none it is over pooled ones, on full trajectories; None if there is nothing.
     """
     for one in _COMPARISONS:
-        if math.isfinite(metrics.get(f"{one.key}/mean", math.nan)):
+        if math.isfinite(metrics.get(f"{one.key}/geometric", math.nan)):
             return one
     return None
-
-
-def ratio_of_means(metrics: Mapping[str, float], compared: Comparison) -> float:
-    """Returns by what share the policy's mean RMSE of speed is lower; NaN if that is not known."""
-    before = metrics.get(key_of("rmse_speed", compared.baseline, compared.scope), math.nan)
-    after = metrics.get(key_of("rmse_speed", "policy", compared.scope), math.nan)
-    return lower_by(before, after)
 
 
 def lower_by(before: float, after: float) -> float:
@@ -82,20 +73,36 @@ def lower_by(before: float, after: float) -> float:
     return (before - after) / before if before > 0 else math.nan
 
 
-def opposite(mean: float, of_means: float) -> str:
-    """Returns what a ratio of means says where a mean of ratios has the other sign; or "".
+_CLOSE = 0.03
+"""Two summaries of an improvement that differ by no more, and not in sign, say the same."""
 
-    A few drivers with small errors may outweigh all others in a mean of ratios.
+
+def summaries_disagree(geometric: float, ratio_of_means: float) -> str:
+    """Returns what the mean errors say where they say something else than the improvement; or "".
+
+    Each driver counts alike in a geometric mean. Drivers with large errors outweigh the others in a
+    ratio of mean errors.
     """
-    if not mean * of_means < 0:
+    if not math.isfinite(geometric) or not math.isfinite(ratio_of_means):
         return ""
-    return f"mean of the pairs' improvements; of the mean RMSE {100 * of_means:+.1f} %"
+    if geometric * ratio_of_means >= 0 and abs(geometric - ratio_of_means) <= _CLOSE:
+        return ""
+    return f"of the mean errors {100 * ratio_of_means:+.1f} %"
 
 
-def contradiction(metrics: Mapping[str, float], compared: Comparison) -> str:
-    """Returns what the means say where the mean improvement has the other sign; or ""."""
-    mean = metrics.get(f"{compared.key}/mean", math.nan)
-    return opposite(mean, ratio_of_means(metrics, compared))
+FEW_DRIVERS = 10
+"""Of fewer drivers than these an improvement says little about others."""
+
+
+def doubts(metrics: Mapping[str, float], compared: Comparison) -> list[str]:
+    """Returns what is to be known beside an improvement, as parts of a sentence."""
+    geometric = metrics.get(f"{compared.key}/geometric", math.nan)
+    note = summaries_disagree(geometric, metrics.get(f"{compared.key}/ratio_of_means", math.nan))
+    parts = [note] if note else []
+    drivers = metrics.get(f"{compared.key}/drivers", math.nan)
+    if drivers < FEW_DRIVERS:
+        parts.append("one driver" if drivers == 1 else f"{drivers:.0f} drivers")
+    return parts
 
 
 def main_error(metrics: Mapping[str, float]) -> float:
@@ -179,10 +186,11 @@ def _improvement(
     metrics: Mapping[str, float], compared: Comparison, values: dict[str, float]
 ) -> str:
     """Returns the improvement in words, and adds its numbers to `values`."""
-    mean = 100 * metrics[f"{compared.key}/mean"]
-    low, high = (100 * metrics.get(f"{compared.key}/ci95_{end}", math.nan) for end in ENDS)
-    values[PERCENT] = round(mean, 1)
-    text = f"{mean:+.1f} %"
+    geometric = 100 * metrics[f"{compared.key}/geometric"]
+    low = 100 * metrics.get(f"{compared.key}/ci95_low", math.nan)
+    high = 100 * metrics.get(f"{compared.key}/ci95_high", math.nan)
+    values[PERCENT] = round(geometric, 1)
+    text = f"{geometric:+.1f} %"
     if math.isfinite(low) and math.isfinite(high):
         values["improvement_low_percent"] = round(low, 1)
         values["improvement_high_percent"] = round(high, 1)
@@ -190,8 +198,7 @@ def _improvement(
     text += f" over {_CONSTANT[compared.baseline]}"
     if compared.scope != "test":
         text += " on full trajectories"
-    opposite = contradiction(metrics, compared)
-    return f"{text}, {opposite}" if opposite else text
+    return ", ".join([text, *doubts(metrics, compared)])
 
 
 def _of_calibration(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
@@ -203,6 +210,3 @@ def _of_calibration(metrics: Mapping[str, float]) -> tuple[dict[str, float], str
             values.setdefault(SPEED_ERROR, round(error, 3))
             words.append(f"{name} {error:.3f} m/s")
     return values, "; ".join(words)
-
-
-ENDS = ("low", "high")

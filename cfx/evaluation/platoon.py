@@ -13,6 +13,7 @@ Shapes: N platoons, V vehicles of each, T frames, n tuned parameters.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -27,9 +28,11 @@ from cfx.evaluation.metrics.safety import hard_braking_frames
 from cfx.evaluation.result import METHODS, Array, Platoon
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.agent import Agent, AgentState
-from cfx.policies.features import History
+from cfx.policies.history import History
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
+
+log = logging.getLogger(__name__)
 
 VEHICLES = 10
 """Followers of a platoon."""
@@ -139,13 +142,13 @@ class _Road:
         acceleration = self.acceleration[:, platoons, index]
         position = self.position[:, platoons, index]
         gap = position[:-1] - LENGTH - position[1:]
-        return History(
-            speed[:-1].reshape(-1, length),
-            acceleration[:-1].reshape(-1, length),
-            speed[1:].reshape(-1, length),
-            acceleration[1:].reshape(-1, length),
-            gap.reshape(-1, length),
-        )
+        return {
+            "leader_speed": speed[:-1].reshape(-1, length),
+            "leader_acceleration": acceleration[:-1].reshape(-1, length),
+            "follower_speed": speed[1:].reshape(-1, length),
+            "follower_acceleration": acceleration[1:].reshape(-1, length),
+            "gap": gap.reshape(-1, length),
+        }
 
 
 def measure_platoons(
@@ -162,11 +165,19 @@ def measure_platoons(
         manoeuvre: what the leader does; None for the standard one.
 
     Returns:
-        None for a model without equations.
+        None for a model without equations, or if no method is simulated: one whose policy reads
+        further signals, such as the weather, is not, as nothing gives them here.
     """
     if model.needs_simulator:
         return None
-    methods = [method for method in METHODS if method in agents]
+    methods = []
+    for method in METHODS:
+        if method in agents and not agents[method][0].core.further_signals:
+            methods.append(method)
+        elif method in agents:
+            log.info("No platoon of the method %s: its inputs read further signals", method)
+    if not methods:
+        return None
     driving = [agents[method][0] for method in methods]
     dt = driving[0].dt
     simulated = []
@@ -185,8 +196,8 @@ def _grouped(model: DrivingModel, agents: Sequence[Agent]) -> list[list[Agent]]:
     """Returns the agents in order, those behind one another together that drive the same model."""
     groups: list[list[Agent]] = []
     for agent in agents:
-        is_alone = agent.head.driven_model(model) is not model
-        if is_alone or not groups or groups[-1][-1].head.driven_model(model) is not model:
+        is_alone = agent.core.head.driven_model(model) is not model
+        if is_alone or not groups or groups[-1][-1].core.head.driven_model(model) is not model:
             groups.append([])
         groups[-1].append(agent)
     return groups
@@ -214,7 +225,7 @@ def simulate_platoons(
         For each agent the speeds of its N platoons `(V + 1, N, T)`, vehicle 0 being the leader, and
         the gaps of the followers `(V, N, T)`.
     """
-    dt, windows, device = agents[0].dt, agents[0].windows, agents[0].scaler.mean.device
+    dt, windows, device = agents[0].dt, agents[0].windows, agents[0].core.scaler.mean.device
     bounds = np.cumsum([0] + [len(agent.names) for agent in agents]).tolist()
     parts = [slice(first, last) for first, last in pairwise(bounds)]
     road = _Road(torch.as_tensor(manoeuvre.speed(dt), device=device), bounds[-1], dt)

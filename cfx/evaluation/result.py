@@ -193,7 +193,6 @@ class Evaluation:
         notes: what the protocol says of its design (`ProtocolResult.notes`).
         recorded: the job's pairs, also those that were not tested; None: not known.
         style: the driving style of their drivers; None: not known.
-        seed: of whatever is drawn from these results, such as the bootstrap of intervals.
     """
 
     about: pd.DataFrame
@@ -210,7 +209,6 @@ class Evaluation:
     notes: Mapping[str, Any] = field(default_factory=dict)
     recorded: PairSet | None = None
     style: StyleResult | None = None
-    seed: int = 0
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cfx.data.pairs import PairSet
 from cfx.evaluation.result import METHODS, Evaluation
-from cfx.evaluation.statistics import improvement_statistics
+from cfx.evaluation.statistics import geometric_over_sites, improvement_statistics
 from cfx.evaluation.tables import values_of
 
 ALL_SITES = "all"
@@ -19,26 +19,23 @@ ALL_SITES = "all"
 BASELINES = ("fixed", "population")
 """What the policy is compared with in each row."""
 
-_RESAMPLES = 9_999
-
 Floats = NDArray[np.float64]
 
 
-def site_table(pairs: PairSet, evaluation: Evaluation, *, seed: int) -> pd.DataFrame | None:
+def site_table(pairs: PairSet, evaluation: Evaluation) -> pd.DataFrame | None:
     """Summarises an evaluation by site; None if the tested pairs were recorded at one site alone.
 
     Args:
         pairs: of the job; those that were not tested do not count.
         evaluation: of the tested ones.
-        seed: of the bootstrap.
 
     Returns:
         A row per scope (`test`, `full_trajectory`), site and driver type (`all`, and each type
         where a site has several): scope, site, driver_type, pairs, drivers, for each method
         `rmse_speed_METHOD` (m/s) and `rmse_gap_METHOD` (m), means over pairs; and for each baseline
-        the policy's improvement of the RMSE of speed `over_BASELINE`, `over_BASELINE_median`,
-        `over_BASELINE_low` and `over_BASELINE_high` (95 %, drivers resampled). The site `all` is
-        the mean over sites, drivers resampled within each site.
+        the policy's geometric improvement of the RMSE of speed `over_BASELINE`, its median over
+        drivers `over_BASELINE_median`, and its 95 % interval over drivers, `over_BASELINE_low` and
+        `over_BASELINE_high`. The site `all` is the mean over sites: see `geometric_over_sites`.
     """
     labels = _labels(pairs, evaluation)
     if labels["site"].nunique() < 2:
@@ -51,13 +48,13 @@ def site_table(pairs: PairSet, evaluation: Evaluation, *, seed: int) -> pd.DataF
             continue
         about = labels.loc[speed.index]
         for site, of_site in about.groupby("site", sort=False):
-            rows.append(_row(scope, str(site), ALL_SITES, of_site, speed, gap, seed))
+            rows.append(_row(scope, str(site), ALL_SITES, of_site, speed, gap))
             if len(set(of_site["driver_type"])) > 1:
                 for kind, of_kind in of_site.groupby("driver_type", sort=False):
                     name = str(kind) or "not known"
-                    rows.append(_row(scope, str(site), name, of_kind, speed, gap, seed))
+                    rows.append(_row(scope, str(site), name, of_kind, speed, gap))
         every = [row for row in rows if row["scope"] == scope and row["driver_type"] == ALL_SITES]
-        rows.append(_mean_of_sites(scope, every, about, speed, seed))
+        rows.append(_mean_of_sites(scope, every, about, speed))
     return pd.DataFrame(rows)
 
 
@@ -80,7 +77,6 @@ def _row(
     about: pd.DataFrame,
     speed: pd.DataFrame,
     gap: pd.DataFrame,
-    seed: int,
 ) -> dict[str, object]:
     """Returns the row of some pairs of a site, of which `about` has the labels."""
     row: dict[str, object] = {
@@ -101,17 +97,16 @@ def _row(
                 own_speed[baseline].to_numpy(),
                 own_speed["policy"].to_numpy(),
                 about["driver"].tolist(),
-                seed=seed,
             )
-            row |= _improvement(baseline, one.mean, one.median, one.ci95_low, one.ci95_high)
+            row |= _improvement(baseline, one.geometric, one.median, one.ci95_low, one.ci95_high)
     return row
 
 
 def _improvement(
-    baseline: str, mean: float, median: float, low: float, high: float
+    baseline: str, geometric: float, median: float, low: float, high: float
 ) -> dict[str, float]:
     name = f"over_{baseline}"
-    return {name: mean, f"{name}_median": median, f"{name}_low": low, f"{name}_high": high}
+    return {name: geometric, f"{name}_median": median, f"{name}_low": low, f"{name}_high": high}
 
 
 def _mean_of_sites(
@@ -119,7 +114,6 @@ def _mean_of_sites(
     rows: Sequence[Mapping[str, object]],
     about: pd.DataFrame,
     speed: pd.DataFrame,
-    seed: int,
 ) -> dict[str, object]:
     """Returns the row in which each site counts once; `rows` are theirs."""
     table = pd.DataFrame(rows)
@@ -131,28 +125,16 @@ def _mean_of_sites(
         "drivers": int(table["drivers"].sum()),
     }
     for name in table.columns:
-        if name.startswith(("rmse_", "over_")) and not name.endswith(("_low", "_high")):
+        if name.startswith("rmse_"):
             row[name] = float(table[name].mean())
     for baseline in BASELINES:
-        if f"over_{baseline}" in row:
-            gain = (speed[baseline] - speed["policy"]) / speed[baseline].where(speed[baseline] > 0)
-            low, high = _interval_over_sites(gain, about, seed)
-            row |= {f"over_{baseline}_low": low, f"over_{baseline}_high": high}
+        if f"over_{baseline}" in table:
+            geometric, low, high = geometric_over_sites(
+                speed[baseline].to_numpy(),
+                speed["policy"].to_numpy(),
+                about["driver"].tolist(),
+                about["site"].tolist(),
+            )
+            median = float(table[f"over_{baseline}_median"].mean())
+            row |= _improvement(baseline, geometric, median, low, high)
     return row
-
-
-def _interval_over_sites(gain: pd.Series, about: pd.DataFrame, seed: int) -> tuple[float, float]:
-    """Returns the 95 % interval of the mean over sites of their mean gain.
-
-    Drivers are resampled within each site, with all their pairs.
-    """
-    generator = np.random.default_rng(seed)
-    means = np.zeros(_RESAMPLES)
-    of_site = about.assign(gain=gain)[np.isfinite(gain)].groupby("site")
-    for _, pairs in of_site:
-        by_driver = pairs.groupby("driver")["gain"]
-        total, number = by_driver.sum().to_numpy(), by_driver.count().to_numpy()
-        drawn = generator.integers(len(total), size=(_RESAMPLES, len(total)))
-        means += total[drawn].sum(1) / number[drawn].sum(1) / of_site.ngroups
-    low, high = np.quantile(means, [0.025, 0.975])
-    return float(low), float(high)

@@ -30,7 +30,6 @@ __all__ = [
     "HIDDEN",
     "WIDTH",
     "Array",
-    "Dash",
     "Line",
     "Paper",
     "blank",
@@ -48,13 +47,11 @@ __all__ = [
     "on_paper",
     "percent_axis",
     "percent_tick",
-    "plain_tick",
     "points",
     "side_by_side",
     "styled",
     "vehicle_colour",
     "wrapped",
-    "write_note",
 ]
 """What plugins may use, as `cfx.plugin.canvas`."""
 

@@ -10,8 +10,6 @@ __all__ = [
     "EDGE",
     "INK",
     "JOB_COLOURS",
-    "TRAIN_COLOUR",
-    "VALIDATION_COLOUR",
     "colour_of",
 ]
 """What plugins may use, as `cfx.plugin.colours`."""

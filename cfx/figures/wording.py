@@ -7,6 +7,7 @@ import os
 import re
 from typing import NamedTuple
 
+from cfx.evaluation.headline import FEW_DRIVERS
 from cfx.evaluation.metrics.base import SCOPES
 
 __all__ = [
@@ -116,8 +117,6 @@ METHOD_TEXTS: dict[str, MethodText] = {
 }
 """Methods and recorded vehicles."""
 
-FEW_DRIVERS = 20
-"""Below it a bootstrap interval over drivers is too narrow."""
 
 TEST, STEADY, FULL_TRAJECTORY = SCOPES
 """Parts of trajectories that metrics are of."""
@@ -161,13 +160,13 @@ def plural(count: int, noun: str) -> str:
 def few_drivers(drivers: int) -> str:
     """Returns a warning where statistics are over few drivers, else "".
 
-    A bootstrap interval over fewer than twenty is too narrow.
+    Their interval holds; what is uncertain is whether they stand for others.
     """
     if not 0 < drivers < FEW_DRIVERS:
         return ""
     return (
-        f"{plural(drivers, 'driver')}: with fewer than {FEW_DRIVERS}, means and intervals say"
-        " little about other drivers."
+        f"{plural(drivers, 'driver')}: with fewer than {FEW_DRIVERS}, an improvement says little"
+        " about other drivers."
     )
 
 

@@ -26,7 +26,8 @@ from cfx.data.pairs import PairBatch
 from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import History, Scaler, measured_history
+from cfx.policies.features import Scaler
+from cfx.policies.history import History, changed, measured_history
 from cfx.policies.valid_range import ValidRange, situations
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import Split, WindowSettings
@@ -226,7 +227,7 @@ def learned_range(training_data: TrainingData, augment: Augment | None = None) -
     rows = _some_of_each(networks, len(training_data.names))
     pair = training_data.pairs.index.to(device)[rows]
     history = measured_history(training_data.recorded, pair[:, None], windows, 1)
-    recorded = History(*(signal[..., 0] for signal in history))
+    recorded = changed(history, lambda signal: signal[..., 0])
     counted = windows <= last[rows, None]
     versions = [situations(recorded)]
     if augment is not None:

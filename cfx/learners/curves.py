@@ -8,10 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-__all__ = [
-    "first_sampled_epoch",
-    "over_networks",
-]
+__all__ = []
 """What plugins may use, as `cfx.plugin.curves`."""
 
 

@@ -22,8 +22,10 @@ from cfx.learners.base import TrainingData
 from cfx.learners.batched import BatchedModule, Training
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.core import Grid
-from cfx.policies.features import Scaler, measured_history, tokens
+from cfx.policies.features import Scaler, tokens
 from cfx.policies.heads.base import ParameterHead
+from cfx.policies.history import measured_history
+from cfx.policies.inputs import policy_inputs
 from cfx.simulation.kernel.compiler import torch_compiled
 
 
@@ -80,7 +82,7 @@ class ImitationDataset(NamedTuple):
         recorded = training_data.pairs.index.to(device)[pair]
         length = training_data.windows.length
         history = measured_history(training_data.recorded, recorded, first, length)
-        seen = tokens(history, policy.inputs, policy.summary).float()
+        seen = tokens(history, policy_inputs(policy.inputs), policy.summary).float()
         unit = head.space.to_unit(labels.parameters).float()
         tokens_of_pairs, mask = windows.to_grid(seen, pairs)
         labels_of_pairs, _ = windows.to_grid(unit, pairs)

@@ -148,23 +148,23 @@ class DrivingModel(Component):
         for declared in self.parameters:
             if declared.is_used(self.settings):
                 continue
-            own = self.space[declared.name]
+            parameter = self.space[declared.name]
             changed = []
             for key in ("low", "high", "default"):
-                if getattr(own, key) != getattr(declared, key):
+                if getattr(parameter, key) != getattr(declared, key):
                     changed.append(key)
-            if own.tuned:
+            if parameter.tuned:
                 changed.append("tuned")
             if not changed:
                 continue
             assert declared.used_with is not None
             setting, value = declared.used_with
             chosen = getattr(self.settings, setting)
-            written = f"{getattr(own, changed[0])}".lower()
+            written = f"{getattr(parameter, changed[0])}".lower()
             raise ConfigError(
-                f"model.parameters.{own.name}.{changed[0]}={written}: the model does not use"
-                f" {own.name} with model.{setting}={chosen}, so it does nothing; leave it out, or"
-                f" set model.{setting}={value}"
+                f"model.parameters.{parameter.name}.{changed[0]}={written}: the model does not use"
+                f" {parameter.name} with model.{setting}={chosen}, so it does nothing; leave it"
+                f" out, or set model.{setting}={value}"
             )
 
     def equations_key(self) -> str:

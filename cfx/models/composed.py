@@ -104,8 +104,8 @@ class Composed(DrivingModel):
 
     def initial_memory(self, speed: Tensor) -> Tensor:
         width = self.memory_size - self.inner.memory_size
-        own = torch.zeros((*speed.shape, width), dtype=speed.dtype, device=speed.device)
-        return torch.cat([self.inner.initial_memory(speed), own], -1)
+        own_memory = torch.zeros((*speed.shape, width), dtype=speed.dtype, device=speed.device)
+        return torch.cat([self.inner.initial_memory(speed), own_memory], -1)
 
     def inside(self, follower: Follower) -> Follower:
         """Returns the follower as the inner model knows it."""
@@ -151,10 +151,10 @@ class Combined(Composed):
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:
-        wanted = self.inner.next_speed(self.inside(follower), leader, p, dt)
+        proposed = self.inner.next_speed(self.inside(follower), leader, p, dt)
         other = self.second.next_speed(self._beside(follower), leader, of_second(p), dt)
         weight = p[WEIGHT.name]
-        return weight * wanted + (1.0 - weight) * other
+        return weight * proposed + (1.0 - weight) * other
 
     def next_memory(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
@@ -307,8 +307,8 @@ class WithResidual(Composed):
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:
-        wanted = self.inner.next_speed(self.inside(follower), leader, p, dt)
-        alone = (wanted - follower.speed) / dt
+        proposed = self.inner.next_speed(self.inside(follower), leader, p, dt)
+        alone = (proposed - follower.speed) / dt
         share = -torch.expm1(-(follower.memory[..., _PASSED] / p[HANDOVER.name]).square())
         held = self._remembered(follower, _HELD, follower.acceleration)
         both = (1.0 - share) * held + share * alone
@@ -326,8 +326,8 @@ class WithResidual(Composed):
         residual = target + (follower.memory[..., _RESIDUAL] - target) * kept
         passed = follower.memory[..., _PASSED] + dt
         inner = super().next_memory(follower, leader, p, dt, speed)
-        own = torch.stack([held, jerk, residual, passed], -1)
-        return torch.cat([inner, own], -1)
+        own_memory = torch.stack([held, jerk, residual, passed], -1)
+        return torch.cat([inner, own_memory], -1)
 
     def _remembered(self, follower: Follower, column: int, at_start: Tensor) -> Tensor:
         """Returns what a column of the memory holds, `(*batch,)`, or this in the first step."""
@@ -382,6 +382,6 @@ class WithSpeedLimit(Composed):
     def next_speed(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:
-        wanted = self.inner.next_speed(follower, leader, p, dt)
+        proposed = self.inner.next_speed(follower, leader, p, dt)
         slowed = follower.speed - COMFORTABLE_BRAKING * dt
-        return torch.minimum(wanted, torch.maximum(p[SPEED_LIMIT], slowed))
+        return torch.minimum(proposed, torch.maximum(p[SPEED_LIMIT], slowed))

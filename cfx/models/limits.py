@@ -49,7 +49,7 @@ class LimitSettings(Settings):
 
 
 def limited_speed(
-    limits: LimitSettings | None, speed: Tensor, acceleration: Tensor, wanted: Tensor, dt: float
+    limits: LimitSettings | None, speed: Tensor, acceleration: Tensor, proposed: Tensor, dt: float
 ) -> Tensor:
     """Returns the speed that a vehicle can have one step later, nearest to the one wanted.
 
@@ -60,20 +60,20 @@ def limited_speed(
         limits: of the vehicle; None: there are none.
         speed: now, `(*batch,)`, m/s.
         acceleration: the last realised one, `(*batch,)`, m/s2.
-        wanted: the model's next speed, `(*batch,)`, m/s.
+        proposed: the model's next speed, `(*batch,)`, m/s.
         dt: time step, s.
 
     Returns:
         `(*batch,)`, m/s, not negative.
     """
     if limits is None:
-        return wanted
+        return proposed
     if limits.response_time is not None:
         share = -math.expm1(-dt / limits.response_time)
-        wanted = speed + dt * acceleration + share * (wanted - speed - dt * acceleration)
+        proposed = speed + dt * acceleration + share * (proposed - speed - dt * acceleration)
     slowest = (speed - limits.emergency_deceleration * dt).clamp(min=0.0)
     fastest = speed + limits.acceleration * dt
-    return torch.minimum(torch.maximum(wanted, slowest), fastest)
+    return torch.minimum(torch.maximum(proposed, slowest), fastest)
 
 
 def at_limits(limits: LimitSettings | None, speed: Tensor, dt: float) -> Tensor:
@@ -87,11 +87,11 @@ def at_limits(limits: LimitSettings | None, speed: Tensor, dt: float) -> Tensor:
     Returns:
         `(*batch, K + 1)` bool, for the acceleration on the way to each frame; frame 0 has none.
     """
-    found = torch.zeros_like(speed, dtype=torch.bool)
+    is_at_limit = torch.zeros_like(speed, dtype=torch.bool)
     if limits is None:
-        return found
+        return is_at_limit
     acceleration = speed.diff(dim=-1) / dt
-    found[..., 1:] = (acceleration >= limits.acceleration - _AT) | (
+    is_at_limit[..., 1:] = (acceleration >= limits.acceleration - _AT) | (
         acceleration <= -limits.emergency_deceleration + _AT
     )
-    return found
+    return is_at_limit

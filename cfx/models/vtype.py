@@ -50,7 +50,7 @@ _HALTING = 1e-4
 
 def sumo_speed(
     v: Tensor,
-    wanted: Tensor,
+    proposed: Tensor,
     *,
     accel: Tensor,
     decel: Tensor,
@@ -58,7 +58,7 @@ def sumo_speed(
     v_max: Tensor,
     dt: float,
 ) -> Tensor:
-    """Returns the speed `(*batch,)`, m/s, that SUMO realises when a model wants `wanted`.
+    """Returns the speed `(*batch,)`, m/s, that SUMO realises when a model wants `proposed`.
 
     With `top = min(v + accel dt, v_max)` the plan is `min(top, wanted)`; it is bounded by 0 and by
     `v - emergency_decel dt`, so that `emergency_decel` is the brake cap, not `decel`, unless that
@@ -67,14 +67,14 @@ def sumo_speed(
 
     Args:
         v: speed now, m/s.
-        wanted: speed that the model asks for, m/s; may be negative.
+        proposed: speed that the model asks for, m/s; may be negative.
         accel, decel, emergency_decel: m/s2, positive.
         v_max: m/s.
         dt: time step, s.
     """
     top = torch.minimum(v + accel * dt, v_max)
     comfortable = (v - decel * dt).clamp(min=0.0)
-    plan = torch.minimum(top, wanted)
+    plan = torch.minimum(top, proposed)
     hardest = torch.minimum(comfortable, (v - emergency_decel * dt).clamp(min=0.0))
     speed = torch.maximum(plan, hardest)
     return torch.where(speed.abs() < _HALTING * dt, 0.0, speed)

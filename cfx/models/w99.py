@@ -223,9 +223,15 @@ class W99(DrivingModel):
             dx, near, too_close, rest, scale=SPACING_WIDTH, temperature=self.temperature
         )
         acceleration = slower(dv, opening_threshold, too_near, rest)
-        wanted = v + acceleration * dt
+        proposed = v + acceleration * dt
         return sumo_speed(
-            v, wanted, accel=cap, decel=p["b"], emergency_decel=p["b_max"], v_max=p["v_max"], dt=dt
+            v,
+            proposed,
+            accel=cap,
+            decel=p["b"],
+            emergency_decel=p["b_max"],
+            v_max=p["v_max"],
+            dt=dt,
         )
 
     def _limits(self, v: Tensor, cc8: Tensor, cc9: Tensor) -> tuple[Tensor, Tensor]:
@@ -233,8 +239,8 @@ class W99(DrivingModel):
         slow = v.clamp(max=_CC9_SPEED)
         if self.settings.variant == "sumo":
             return cc8 + cc9 * slow, cc8
-        wanted = cc8 + (cc9 - cc8) * slow / _CC9_SPEED
-        return wanted, wanted
+        free_acceleration = cc8 + (cc9 - cc8) * slow / _CC9_SPEED
+        return free_acceleration, free_acceleration
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
         if self.settings.variant != "sumo":

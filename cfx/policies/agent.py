@@ -23,21 +23,18 @@ from torch import Tensor
 
 from cfx.core import registry
 from cfx.core.parameters import ParameterSpace
-from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.pairs import PairBatch
 from cfx.errors import DataError, PluginError
-from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.context import UNSEEN, ContextRule, DriverContext, ExpectedError
 from cfx.policies.core import ANY_DRIVER, AgentCore, driver_places
-from cfx.policies.driver_features import measure
-from cfx.policies.features import History, Scaler, measured_history
-from cfx.policies.heads.base import ParameterHead
-from cfx.policies.heads.offset import blended, shrunk
+from cfx.policies.heads.offset import blended
+from cfx.policies.history import History, measured_history
 from cfx.policies.valid_range import RANGE_SIGNALS, ValidRange, situation_of, weight_of_answer
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import WindowSettings
 
 if TYPE_CHECKING:
-    import pandas as pd
+    pass
 
 
 _OF_DRIVERS = ("conditioning", "score", "beyond", "latent")
@@ -79,7 +76,9 @@ class AgentState(NamedTuple):
         state = self.state.new_zeros(shape)
         state[network, place] = self.state[network, self.place[drivers]]
         kept = {name: getattr(self, name)[drivers] for name in _OF_DRIVERS}
-        base = None if self.base is None else self.base[drivers]
+        base = self.base
+        if base is not None:
+            base = base[drivers]
         return AgentState(network=network, place=place, state=state, base=base, **kept)
 
 
@@ -136,39 +135,9 @@ class Agent:
     dispersion: Tensor | None = None
 
     @property
-    def policy(self) -> Policy:
-        """The component that built the networks."""
-        return self.core.policy
-
-    @property
-    def network(self) -> PolicyNetwork:
-        """The networks."""
-        return self.core.network
-
-    @property
-    def scaler(self) -> Scaler:
-        """Normalises what the networks read."""
-        return self.core.scaler
-
-    @property
-    def head(self) -> ParameterHead:
-        """Makes parameters of answers."""
-        return self.core.head
-
-    @property
     def space(self) -> ParameterSpace:
         """The parameters that the agent chooses, with their bounds."""
         return self.core.head.space
-
-    @property
-    def model_space(self) -> ParameterSpace:
-        """Those of them that the driving model has."""
-        return self.core.head.model_space
-
-    @property
-    def is_stochastic(self) -> bool:
-        """Whether it draws random numbers."""
-        return self.head.noise_width > 0
 
     def stepper(self, simulator: Stepper) -> Stepper:
         """Returns what takes the steps of the model that this agent drives.
@@ -179,53 +148,10 @@ class Agent:
         Raises:
             ConfigError: the head needs a model around it, which this simulator does not have.
         """
-        model = self.head.driven_model(simulator.model)
+        model = self.core.head.driven_model(simulator.model)
         if model is simulator.model:
             return simulator
         return simulator.for_model(model)
-
-    def base_of(self, parameters: Tensor) -> Tensor:
-        """Returns the base of drivers with these calibrated parameters, `(D, n)`, SI units.
-
-        Args:
-            parameters: of the driving model, `(D, m)`, SI units.
-        """
-        complete = self.head.completed(parameters)
-        return shrunk(self.space, complete, self.context_rule.shrinkage)
-
-    def driver_features_of(
-        self, batch: PairBatch, until: Tensor, since: Tensor | None = None
-    ) -> Tensor | None:
-        """Measures the driver features of D drivers.
-
-        Args:
-            batch: their D pairs.
-            until: `(D,)`, the frame before which each is measured.
-            since: `(D,)`, the frame from which on; None: the first.
-
-        Returns:
-            `(D, k)`, NaN for drivers of whom too little was measured; None if the policy reads
-            none.
-        """
-        if not self.core.driver_features:
-            return None
-        if since is None:
-            since = torch.zeros_like(until)
-        return measure(batch, self.core.driver_features, self.dt, since, until)
-
-    def unlikeness(self, features: Tensor, network: Tensor) -> Tensor:
-        """Returns how far driver features are from those of the drivers that were learned from.
-
-        Args:
-            features: `(D, k)`, as `driver_features_of` returns them.
-            network: which network's drivers each is compared with, `(D,)`.
-
-        Returns:
-            `(D, k)`, in standard deviations from their mean; NaN where a feature is unknown.
-        """
-        count = features.shape[1]
-        mean, scale = self.scaler.mean[network, -count:], self.scaler.scale[network, -count:]
-        return (features - mean.to(features)) / scale.to(features)
 
     def begin(self, network: Tensor, context: DriverContext = UNSEEN) -> AgentState:
         """Returns the state of D drivers before their first window.
@@ -236,15 +162,16 @@ class Agent:
         """
         place = driver_places(network)
         base = self._unit_base(network, context)
-        known = base if base is not None else self.scaler.mean.new_zeros((len(network), 0)).double()
+        read_of_base = base
+        if read_of_base is None:
+            read_of_base = self.core.scaler.mean.new_zeros((len(network), 0)).double()
         features = self._known_features(network, context)
-        state = self.network.initial_state(len(self.names), int(place.max()) + 1)
-        conditioning = self.core.condition(known, features)
+        state = self.core.network.initial_state(len(self.names), int(place.max()) + 1)
+        conditioning = self.core.condition(read_of_base, features)
         score = torch.zeros(len(network), dtype=torch.float64, device=network.device)
-        beyond = torch.zeros(
-            (len(network), 2 * len(RANGE_SIGNALS)), dtype=torch.bool, device=network.device
-        )
-        latent = score.new_zeros((len(network), self.head.latent_width))
+        unusual = (len(network), 2 * len(RANGE_SIGNALS))
+        beyond = torch.zeros(unusual, dtype=torch.bool, device=network.device)
+        latent = score.new_zeros((len(network), self.core.head.latent_width))
         return AgentState(network, place, state, base, conditioning, score, beyond, latent)
 
     def observe(self, history: History, state: AgentState, present: Tensor) -> AgentState:
@@ -290,11 +217,11 @@ class Agent:
         answer, after = self._answer(history, state)
         if not bool(answer.isfinite().all()):
             raise PluginError(
-                f"{registry.origin(self.policy)}: its networks answer numbers that are not finite;"
-                " train with a smaller learner.learning_rate, or repair that policy"
+                f"{registry.origin(self.core.policy)}: its networks answer numbers that are not"
+                " finite; train with a smaller learner.learning_rate, or repair that policy"
             )
-        if generator is not None and self.is_stochastic:
-            shape = (len(answer), self.head.noise_width)
+        if generator is not None and self.core.head.is_stochastic:
+            shape = (len(answer), self.core.head.noise_width)
             noise = torch.randn(shape, generator=generator, dtype=torch.float64)
         return self._apply(answer, history, after, noise)
 
@@ -328,7 +255,7 @@ class Agent:
         if base is not None:
             return base
         if self.population is not None:
-            return self.head.completed(self.population[network].double())
+            return self.core.head.completed(self.population[network].double())
         return self.space.defaults().double().expand(len(network), -1)
 
     def burn_in(
@@ -352,66 +279,6 @@ class Agent:
             history = measured_history(batch, pairs, frame, self.windows.length)
             state = self.observe(history, state, (frame < until) & (frame >= since))
         return state
-
-    def predict_frame(self, frame: pd.DataFrame) -> pd.DataFrame:
-        """Chooses parameters for the end of each pair in a tidy table.
-
-        Args:
-            frame: measured history in the tidy pair layout, one or more pairs with the agent's time
-                step.
-
-        Returns:
-            A row per pair: `pair_id` and one column per tuned parameter (SI units), for the window
-            that starts at the pair's last frame. A pair that the agent was trained for is driven by
-            its own network; any other by the only network there is, or the one named `all`.
-
-        Raises:
-            DataError: the table is not in the tidy layout, its time step is another, or it is not
-                clear which network to use.
-        """
-        import pandas as pd
-
-        from cfx.data.tidy import pairs_from_frame
-
-        pairs = pairs_from_frame(frame, source="the table given to the policy")
-        if abs(pairs.dt - self.dt) > 1e-6:
-            raise DataError(
-                f"the policy was trained at time steps of {self.dt:g} s, the table has"
-                f" {pairs.dt:g} s; resample the table"
-            )
-        batch = PairBatch.of(pairs)
-        until = batch.lengths - 1
-        context = DriverContext(driver_features=self.driver_features_of(batch, until))
-        state = self.burn_in(batch, until, self.begin(self.networks_for(pairs), context))
-        everyone = torch.arange(len(batch))
-        now = measured_history(batch, everyone, until, self.windows.length)
-        chosen, _ = self.act(now, state)
-        table = pd.DataFrame(chosen.tolist(), columns=list(self.space.names))
-        table.insert(0, "pair_id", [pair.pair_id for pair in pairs])
-        return table
-
-    def networks_for(self, pairs: PairSet) -> Tensor:
-        """Returns which network drives each pair, `(P,)`.
-
-        Raises:
-            DataError: a pair is none of those that the networks were trained for, and no network is
-                for any driver.
-        """
-        if len(self.names) == 1:
-            return torch.zeros(len(pairs), dtype=torch.int64)
-        numbers = []
-        for pair in pairs:
-            if pair.pair_id in self.names:
-                numbers.append(self.names.index(pair.pair_id))
-            elif ANY_DRIVER in self.names:
-                numbers.append(self.names.index(ANY_DRIVER))
-            else:
-                raise DataError(
-                    f"pair '{pair.pair_id}' has no network of its own among the {len(self.names)}"
-                    " that were trained, one per pair; train with protocol.networks=all or"
-                    " protocol=across_drivers to drive others"
-                )
-        return torch.tensor(numbers)
 
     def for_unseen_drivers(self) -> Agent:
         """Returns the agent with one network for any driver: the only one, or the one named `all`.
@@ -443,7 +310,8 @@ class Agent:
         changed: dict[str, Any] = {}
         for name in ("base", "population", "dispersion"):
             value = getattr(self, name)
-            changed[name] = None if value is None else change(value)
+            if value is not None:
+                changed[name] = change(value)
         if self.valid_range is not None:
             changed["valid_range"] = ValidRange(*map(change, self.valid_range))
         return replace(self, **changed)
@@ -451,7 +319,7 @@ class Agent:
     def _answer(self, history: History, state: AgentState) -> tuple[Tensor, AgentState]:
         """Returns the networks' answers `(D, n)`, in the history's dtype, and their state."""
         answers, after = self.core.answer(self._features(history, state), state.state)
-        answer = answers[state.network, state.place].to(history.follower_speed.dtype)
+        answer = answers[state.network, state.place].to(history["follower_speed"].dtype)
         return answer, state._replace(state=after)
 
     def _apply(
@@ -464,45 +332,46 @@ class Agent:
             beyond = self.valid_range.beyond(situation, state.network)
             state = state._replace(score=score, beyond=beyond)
         unit = self._faded(answer.double(), state).to(answer.dtype)
-        chosen = self.head.measured(self.space.from_unit(unit), history, self.dt)
+        chosen = self.core.head.measured(self.space.from_unit(unit), history, self.dt)
         if noise is None:
             return chosen, state
         noise = noise.to(chosen)
         if self.dispersion is not None:
             noise = noise * self.dispersion[state.network, None].to(noise)
         window_s = self.windows.stride * self.dt
-        drawn, latent = self.head.sampled(chosen, noise, state.latent.to(chosen), window_s)
+        drawn, latent = self.core.head.sampled(chosen, noise, state.latent.to(chosen), window_s)
         return drawn, state._replace(latent=latent.to(state.latent))
 
     def _faded(self, answer: Tensor, state: AgentState) -> Tensor:
         """Returns the parameters `(D, n)`, in unit space, of answers as far as they are used."""
-        unit = self.head.unit_parameters(answer, state.base)
+        unit = self.core.head.unit_parameters(answer, state.base)
         fallback = state.base
         if fallback is None:
             if self.population is None:
                 return unit
             population = self.population[state.network].double()
-            fallback = self.space.to_unit(self.head.completed(population))
+            fallback = self.space.to_unit(self.core.head.completed(population))
         weight = weight_of_answer(state.score)[:, None]
         return torch.where(weight < 1.0, blended(fallback, unit, weight), unit)
 
     def _unit_base(self, network: Tensor, context: DriverContext) -> Tensor | None:
         """Returns the drivers' base in unit space, `(D, n)`, in double precision."""
-        if not self.head.needs_base:
+        if not self.core.head.needs_base:
             return None
         base = context.base
         if base is None:
             if self.base is None:
-                raise ValueError(f"the {self.head.name} head needs a base, and this agent has none")
+                name = self.core.head.name
+                raise ValueError(f"the {name} head needs a base, and this agent has none")
             base = self.base[network]
-        return self.space.to_unit(self.head.completed(base.double()))
+        return self.space.to_unit(self.core.head.completed(base.double()))
 
     def _known_features(self, network: Tensor, context: DriverContext) -> Tensor | None:
         """Returns driver features `(D, k)`, the training drivers' mean where they are unknown."""
         count = len(self.core.driver_features)
         if count == 0:
             return None
-        usual = self.scaler.mean[network, -count:].double()
+        usual = self.core.scaler.mean[network, -count:].double()
         features = context.driver_features
         if features is None:
             return usual
@@ -513,6 +382,6 @@ class Agent:
         seen = self.core.encode(history)
         features = torch.cat([seen, state.conditioning.to(seen.dtype)], -1)
         networks, drivers, _ = state.state.shape
-        grid = self.scaler.mean.new_zeros((networks, drivers, features.shape[-1]))
+        grid = self.core.scaler.mean.new_zeros((networks, drivers, features.shape[-1]))
         grid[state.network, state.place] = features.to(grid.dtype)
         return grid

@@ -8,15 +8,18 @@ with a network each cost about as much as one.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import partial
 from typing import TYPE_CHECKING, Annotated, ClassVar, Self
 
 import torch
 from pydantic import BeforeValidator, Field
 from torch import Tensor, nn
 
+from cfx.core import registry
 from cfx.core.component import Component, Settings
 from cfx.policies.driver_features import DRIVER_FEATURE_SETS, DRIVER_FEATURES
-from cfx.policies.features import INPUT_SETS, INPUTS, SITUATION, Summary, named
+from cfx.policies.features import Summary, named
+from cfx.policies.inputs import INPUT_SETS, SITUATION
 
 if TYPE_CHECKING:
     from cfx.models.base import DrivingModel
@@ -60,13 +63,14 @@ class PolicyNetwork(nn.Module, ABC):
         """
 
 
-_NAMED_FEATURES = named(DRIVER_FEATURE_SETS, DRIVER_FEATURES, "driver feature")
+_NAMED_INPUTS = named(INPUT_SETS, partial(registry.names, "input"), "input")
+_NAMED_FEATURES = named(DRIVER_FEATURE_SETS, DRIVER_FEATURES.keys, "driver feature")
 
 
 class PolicySettings(Settings):
     """Settings of policies that read states."""
 
-    inputs: Annotated[tuple[str, ...], BeforeValidator(named(INPUT_SETS, INPUTS, "input"))] = Field(
+    inputs: Annotated[tuple[str, ...], BeforeValidator(_NAMED_INPUTS)] = Field(
         SITUATION,
         description="signals that the policy sees, of leader_speed, follower_speed, gap,"
         " relative_speed, time_headway, leader_acceleration, follower_acceleration,"

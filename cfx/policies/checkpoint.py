@@ -116,7 +116,7 @@ class _Description(BaseModel):
             policy=dict(agent.policy_node),
             model=dict(agent.model_node),
             parameters=agent.space.names,
-            head=agent.head.name,
+            head=agent.core.head.name,
             windows=agent.windows,
             dt=agent.dt,
             names=agent.names,
@@ -144,10 +144,10 @@ def _agent(
     """
     scaler = Scaler(weights["scaler.mean"], weights["scaler.scale"])
     expected = features_read(policy, head, description.windows.length)
-    networks, found = scaler.mean.shape
-    if found != expected:
+    networks, features = scaler.mean.shape
+    if features != expected:
         raise ValueError(
-            f"the weights read {found} features, the policy's settings give {expected}"
+            f"the weights read {features} features, the policy's settings give {expected}"
         )
     if networks != len(description.names) or scaler.scale.shape != scaler.mean.shape:
         raise ValueError(f"there are weights of {networks} networks")
@@ -169,7 +169,10 @@ def _agent(
             raise ValueError(f"'{name}' has the shape {tuple(value.shape)}")
         if not bool(value.isfinite().all()):
             raise ValueError(f"'{name}' holds a number that is not finite")
-    valid_range = _named(weights, _RANGE)
+    valid_range = None
+    tensors_of_range = _named(weights, _RANGE)
+    if tensors_of_range:
+        valid_range = ValidRange(**tensors_of_range)
     trained = _named(weights, "network.")
     network = network_with_weights(policy, trained, description.ensemble_size, scaler, head.answers)
     return Agent(
@@ -190,16 +193,16 @@ def _agent(
         trained_on=TrainedOn(
             description.learned_from, description.recorded, description.expected_error
         ),
-        valid_range=ValidRange(**valid_range) if valid_range else None,
+        valid_range=valid_range,
         dispersion=weights.get("dispersion"),
     )
 
 
 def _tensors(agent: Agent) -> dict[str, Tensor]:
     tensors = {}
-    for name, value in agent.network.state_dict().items():
+    for name, value in agent.core.network.state_dict().items():
         tensors[f"network.{name}"] = value.cpu()
-    for name, value in agent.scaler.state_dict().items():
+    for name, value in agent.core.scaler.state_dict().items():
         tensors[f"scaler.{name}"] = value.cpu()
     for name in ("base", "population", "dispersion"):
         value = getattr(agent, name)
@@ -213,7 +216,11 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
 
 def _named(weights: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Returns the tensors whose names have a prefix, without it."""
-    return {k.removeprefix(prefix): v for k, v in weights.items() if k.startswith(prefix)}
+    named = {}
+    for name, value in weights.items():
+        if name.startswith(prefix):
+            named[name.removeprefix(prefix)] = value
+    return named
 
 
 def _read(folder: Path) -> tuple[_Description, dict[str, Tensor]]:

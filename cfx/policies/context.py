@@ -102,8 +102,8 @@ def conformal_bound(errors: Floats, group: NDArray[np.int64]) -> float | None:
         The quantile with the correction for a finite number of drivers; None where nine or fewer
         are known, of whom none is a bound.
     """
-    known = np.isfinite(errors)
-    errors, group = errors[known], group[known]
+    is_known = np.isfinite(errors)
+    errors, group = errors[is_known], group[is_known]
     if math.ceil(LEVEL * (len(errors) + 1)) > len(errors):
         return None
     _, number, size = np.unique(group, return_inverse=True, return_counts=True)

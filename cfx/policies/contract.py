@@ -35,7 +35,9 @@ def random_tokens(policy: Policy) -> Tensor:
 def answers_in_the_precision_of_a_job(policy: Policy) -> None:
     # A learner trains in single precision; what needs no training computes in double precision, so
     # that constants stay what they are.
-    dtype = torch.float32 if policy.trainable else torch.float64
+    dtype = torch.float64
+    if policy.trainable:
+        dtype = torch.float32
     with torch.no_grad(), torch.random.fork_rng(devices=[]):
         network = build(policy, features_of(policy), seed=1, dtype=dtype)
         assert isinstance(network, PolicyNetwork), (
@@ -43,13 +45,16 @@ def answers_in_the_precision_of_a_job(policy: Policy) -> None:
         )
         state = network.initial_state(NETWORKS, DRIVERS)
         answer, after = network.eval()(random_tokens(policy).to(dtype), state)
-    known = isinstance(state, Tensor) and state.dim() == 3
-    shape = (NETWORKS, DRIVERS, state.shape[2] if known else 0)
+    width = 0
+    if isinstance(state, Tensor) and state.dim() == 3:
+        width = state.shape[2]
+    shape = (NETWORKS, DRIVERS, width)
     words = "(networks, drivers, s)"
     expect_tensor(state, "initial_state", shape, getattr(state, "dtype", dtype), words)
     expect_tensor(after, "the state after the last window", shape, state.dtype, words)
-    wanted = (NETWORKS, DRIVERS, WINDOWS, PARAMETERS)
-    expect_tensor(answer, "forward", wanted, dtype, "(networks, drivers, windows, parameters)")
+    words = "(networks, drivers, windows, parameters)"
+    shape_of_answers = (NETWORKS, DRIVERS, WINDOWS, PARAMETERS)
+    expect_tensor(answer, "forward", shape_of_answers, dtype, words)
     assert bool(((answer >= 0) & (answer <= 1)).all()), (  # written so that NaN fails too
         "forward answers NaN or a number outside [0, 1]; parameters are chosen in unit space"
     )

@@ -13,8 +13,10 @@ import torch
 from torch import Tensor
 
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import History, Scaler, token_width, tokens
+from cfx.policies.features import Scaler, token_width, tokens
 from cfx.policies.heads.base import ParameterHead
+from cfx.policies.history import History
+from cfx.policies.inputs import policy_inputs, signals_beyond_recordings
 
 ANY_DRIVER = "all"
 """Name of the network that is for any driver."""
@@ -87,6 +89,7 @@ class AgentCore:
             then driver features.
         head: makes parameters of answers.
         inputs, summary, driver_features: what the networks read, as the policy's settings say.
+        further_signals: those that the inputs read beyond the ones of every recording.
     """
 
     def __init__(
@@ -96,7 +99,8 @@ class AgentCore:
         self.network = network
         self.scaler = scaler
         self.head = head
-        self.inputs = policy.inputs
+        self.inputs = policy_inputs(policy.inputs)
+        self.further_signals = signals_beyond_recordings(self.inputs)
         self.summary = policy.summary
         self.driver_features = policy.driver_features
 

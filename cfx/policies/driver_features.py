@@ -22,7 +22,7 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch
-from cfx.policies.features import History
+from cfx.policies.history import History, changed, history_of
 
 MOVING = 2.0
 """m/s: frames in which the follower is slower say nothing of their time headway."""
@@ -51,7 +51,7 @@ _CLEARLY, _CLEARLY_SHARE = 0.05, 0.1
 weighs 1/e of it."""
 
 
-class Measured(NamedTuple):
+class TrajectoryPart(NamedTuple):
     """Parts of P trajectories.
 
     Attributes:
@@ -67,7 +67,7 @@ class Measured(NamedTuple):
     @property
     def moving(self) -> Tensor:
         """The frames of the part in which the follower moves, bool `(P, T)`."""
-        return self.counted & (self.signals.follower_speed > MOVING)
+        return self.counted & (self.signals["follower_speed"] > MOVING)
 
 
 def _mean(values: Tensor, counted: Tensor) -> Tensor:
@@ -79,63 +79,63 @@ def _log_rms(values: Tensor, counted: Tensor) -> Tensor:
     return torch.log(_mean(values.square(), counted).sqrt() + _ACCURACY)
 
 
-def _time_headway(m: Measured) -> Tensor:
+def _time_headway(part: TrajectoryPart) -> Tensor:
     """The mean logarithm of gap (m) over speed (m/s)."""
-    speed = m.signals.follower_speed.clamp(min=MOVING)
-    headway = m.signals.gap.clamp(min=_LEAST_GAP) / speed
-    return _mean(headway.log(), m.moving)
+    speed = part.signals["follower_speed"].clamp(min=MOVING)
+    headway = part.signals["gap"].clamp(min=_LEAST_GAP) / speed
+    return _mean(headway.log(), part.moving)
 
 
-def _time_gap(m: Measured) -> Tensor:
+def _time_gap(part: TrajectoryPart) -> Tensor:
     """By how much the gap grows with speed, s: ridge regression, as speed may hardly vary."""
-    speed = m.signals.follower_speed
-    speed = speed - _mean(speed, m.counted)[:, None]
-    gap = m.signals.gap
-    gap = gap - _mean(gap, m.counted)[:, None]
-    covariance = _mean(speed * gap, m.counted)
-    variance = _mean(speed.square(), m.counted)
+    speed = part.signals["follower_speed"]
+    speed = speed - _mean(speed, part.counted)[:, None]
+    gap = part.signals["gap"]
+    gap = gap - _mean(gap, part.counted)[:, None]
+    covariance = _mean(speed * gap, part.counted)
+    variance = _mean(speed.square(), part.counted)
     return (covariance + _FLAT * _USUAL_GAP) / (variance + _FLAT)
 
 
-def _standstill_gap(m: Measured) -> Tensor:
+def _standstill_gap(part: TrajectoryPart) -> Tensor:
     """The gap that this regression leaves at standstill, m."""
-    speed = _mean(m.signals.follower_speed, m.counted)
-    return _mean(m.signals.gap, m.counted) - _time_gap(m) * speed
+    speed = _mean(part.signals["follower_speed"], part.counted)
+    return _mean(part.signals["gap"], part.counted) - _time_gap(part) * speed
 
 
-def _speed_difference(m: Measured) -> Tensor:
+def _speed_difference(part: TrajectoryPart) -> Tensor:
     """The logarithm of the root mean square of the difference to the leader's speed, m/s."""
-    return _log_rms(m.signals.leader_speed - m.signals.follower_speed, m.counted)
+    return _log_rms(part.signals["leader_speed"] - part.signals["follower_speed"], part.counted)
 
 
-def _acceleration(m: Measured) -> Tensor:
+def _acceleration(part: TrajectoryPart) -> Tensor:
     """The logarithm of the root mean square acceleration, m/s2."""
-    return _log_rms(m.signals.follower_acceleration, m.counted)
+    return _log_rms(part.signals["follower_acceleration"], part.counted)
 
 
-def _response_time(m: Measured) -> Tensor:
+def _response_time(part: TrajectoryPart) -> Tensor:
     """How long after their leader a driver does the same, s.
 
     The mean of delays, weighted by how little the delayed speeds differ.
     """
-    step = max(1, round(_DELAY_STEP / m.dt))
-    longest = max(1, round(_LONGEST_DELAY / m.dt))
-    frames = m.counted.shape[1]
+    step = max(1, round(_DELAY_STEP / part.dt))
+    longest = max(1, round(_LONGEST_DELAY / part.dt))
+    frames = part.counted.shape[1]
     delays = range(0, min(longest, frames - 1) + 1, step)
     variances = []
     for delay in delays:
-        both = m.counted[:, delay:] & m.counted[:, : frames - delay]
-        leader = m.signals.leader_speed[:, : frames - delay]
-        apart = m.signals.follower_speed[:, delay:] - leader
+        both = part.counted[:, delay:] & part.counted[:, : frames - delay]
+        leader = part.signals["leader_speed"][:, : frames - delay]
+        apart = part.signals["follower_speed"][:, delay:] - leader
         variances.append(_mean((apart - _mean(apart, both)[:, None]).square(), both))
     variance = torch.stack(variances, 1)
     least = variance.min(1, keepdim=True).values
     weight = torch.softmax(-(variance - least) / (_CLEARLY + _CLEARLY_SHARE * least), 1)
-    seconds = [delay * m.dt for delay in delays]
+    seconds = [delay * part.dt for delay in delays]
     return weight @ torch.tensor(seconds, dtype=weight.dtype, device=weight.device)
 
 
-DRIVER_FEATURES: dict[str, Callable[[Measured], Tensor]] = {
+DRIVER_FEATURES: dict[str, Callable[[TrajectoryPart], Tensor]] = {
     "time_headway": _time_headway,
     "time_gap": _time_gap,
     "standstill_gap": _standstill_gap,
@@ -166,8 +166,8 @@ def measure(
         `(P, k)` float64; NaN for a driver who moved for less than `LEAST` seconds of that.
     """
     frame = torch.arange(batch.mask.shape[1], device=until.device)
-    counted = batch.mask & (frame >= since[:, None]) & (frame < until[:, None])
-    measured = Measured(History.of(batch).double(), counted, dt)
-    values = torch.stack([DRIVER_FEATURES[name](measured) for name in names], -1)
-    known = measured.moving.sum(1) * dt >= LEAST
-    return torch.where(known[:, None], values, torch.nan)
+    in_part = batch.mask & (frame >= since[:, None]) & (frame < until[:, None])
+    part = TrajectoryPart(changed(history_of(batch), torch.Tensor.double), in_part, dt)
+    values = torch.stack([DRIVER_FEATURES[name](part) for name in names], -1)
+    is_known = part.moving.sum(1) * dt >= LEAST
+    return torch.where(is_known[:, None], values, torch.nan)

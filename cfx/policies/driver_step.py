@@ -5,28 +5,31 @@ what is remembered of them to their next speed. It knows no simulator: live driv
 programs, environments for reinforcement learning and exported networks are made of it.
 
 Shapes: D drivers, L frames of a token, n tuned parameters, m width of the model's memory, s width
-of the network's state, q numbers that a stochastic head keeps, k random numbers of a window.
+of the network's state, q numbers that a stochastic head keeps, k random numbers of a window, g
+signals: those of `OBSERVED`, then further ones that inputs of the policy read.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from cfx.core.registry import create
+from cfx.data.signals import OBSERVED
 from cfx.errors import ConfigError, DataError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.context import UNSEEN, DriverContext
-from cfx.policies.features import History
 from cfx.simulation.step import advance_vehicle
 
 FREE_ROAD_M = 1e6
 """m: a vehicle this far ahead is none, and the road is free; so is a gap of infinity."""
 
-_GAP = History._fields.index("gap")
+_FOLLOWER_SPEED, _GAP = OBSERVED.index("follower_speed"), OBSERVED.index("gap")
+"""Columns of a frame."""
 
 
 class Motion(NamedTuple):
@@ -46,7 +49,7 @@ class DriverState(NamedTuple):
 
     Attributes:
         steps: since the driver began, `(D,)` int64.
-        history: the signals of `History` at the last L frames, `(D, 5, L)`, SI units.
+        history: the signals of `DriverStep.signals` at the last L frames, `(D, g, L)`, SI units.
         parameters: those that hold in this window, `(D, n)`, SI units.
         memory: of the model, `(D, m)`.
         network: of the policy's network, `(D, s)`, in its precision.
@@ -98,6 +101,9 @@ class DriverStep:
         model: what it drives: its driving model, or one around it.
         dt: the time step, s.
         noise_width: k; 0: nothing is left to chance.
+        further_signals: what inputs of the policy read beyond the motion of both vehicles and the
+            gap; each step is given them too.
+        signals: names of all g signals, in the order of `DriverState.history`.
     """
 
     def __init__(self, agent: Agent, context: DriverContext = UNSEEN) -> None:
@@ -110,17 +116,21 @@ class DriverStep:
                 " so that nothing else can drive it; give a policy of a model that cfx has, such as"
                 " krauss or idm"
             )
-        self.model = self.agent.head.driven_model(model)
+        self.model = self.agent.core.head.driven_model(model)
         self.dt = self.agent.dt
-        self.noise_width = self.agent.head.noise_width
+        self.noise_width = self.agent.core.head.noise_width
+        self.further_signals = self.agent.core.further_signals
+        self.signals = (*OBSERVED, *(signal.name for signal in self.further_signals))
         self._begun = self.agent.begin(torch.zeros(1, dtype=torch.int64), context)
-        base = None if self._begun.base is None else self.agent.space.from_unit(self._begun.base)
+        base = self._begun.base
+        if base is not None:
+            base = self.agent.space.from_unit(base)
         self._free_parameters = self.agent.free_road_parameters(self._begun.network, base)
 
     def begin(self, drivers: int) -> DriverState:
         """Returns the state of D drivers before their first step: zeros."""
         begun = self._begun
-        signals, length = len(History._fields), self.agent.windows.length
+        signals, length = len(self.signals), self.agent.windows.length
         return DriverState(
             torch.zeros(drivers, dtype=torch.int64),
             torch.zeros((drivers, signals, length), dtype=torch.float64),
@@ -139,6 +149,7 @@ class DriverStep:
         leader: Motion,
         gap: Tensor,
         noise: Tensor | None = None,
+        surroundings: Mapping[str, Tensor] | None = None,
     ) -> tuple[Tensor, DriverState]:
         """Returns the next speeds of D drivers.
 
@@ -149,21 +160,26 @@ class DriverStep:
             gap: bumper to bumper, `(D,)`, m; infinity: nobody is ahead.
             noise: standard normal, `(D, k)`, of which a driver whose window begins draws; None:
                 nothing is drawn.
+            surroundings: the policy's further signals, by name, `(D,)` each; None where it has
+                none.
 
         Returns:
             Speeds one time step later, `(D,)`, m/s, and the state then.
 
         Raises:
-            DataError: a signal is not a number, or infinite where it is not the gap of a free road.
+            DataError: a signal is missing or not a number, or infinite where it is not the gap of a
+                free road.
         """
         leader, gap = _as_known(ego, leader, gap)
-        frame = _frame(ego, leader, gap)
+        frame = self._frame(ego, leader, gap, surroundings)
         if not bool(frame.isfinite().all()):
-            raise DataError(_not_finite(frame))
+            raise DataError(self._not_finite(frame))
         state = self._remembered(state, frame)
         due = self._is_due(state).nonzero().flatten()
         if len(due):
-            drawn = None if noise is None else noise[due]
+            drawn = noise
+            if drawn is not None:
+                drawn = drawn[due]
             state = state.with_drivers(due, self._chosen(state.of(due), drawn))
         return self._advanced(state, ego, leader, gap)
 
@@ -174,6 +190,7 @@ class DriverStep:
         leader: Motion,
         gap: Tensor,
         noise: Tensor | None = None,
+        surroundings: Mapping[str, Tensor] | None = None,
     ) -> tuple[Tensor, DriverState]:
         """As a call, but no value branches, so that the step exports to other runtimes.
 
@@ -181,7 +198,7 @@ class DriverStep:
         begins. Signals that a call refuses make the speed of their driver NaN.
         """
         leader, gap = _as_known(ego, leader, gap)
-        frame = _frame(ego, leader, gap)
+        frame = self._frame(ego, leader, gap, surroundings)
         state = self._remembered(state, frame)
         due = self._is_due(state)
         columns = []
@@ -198,13 +215,13 @@ class DriverStep:
 
         Args:
             state: before it.
-            frame: the signals of `History`, `(D, 5)`.
+            frame: `(D, g)`.
         """
         is_free = frame[:, _GAP] >= FREE_ROAD_M
         begins = (state.steps == 0) | (is_free != _on_free_road(state))
         signals = frame[..., None]
         going = torch.cat([state.history[..., 1:], signals], -1)
-        initial = self.model.initial_memory(History(*frame.unbind(1)).follower_speed)
+        initial = self.model.initial_memory(frame[:, _FOLLOWER_SPEED])
         chosen = torch.where(is_free[:, None], self._free_parameters, state.parameters)
         return state._replace(
             steps=torch.where(begins, 0, state.steps),
@@ -223,8 +240,10 @@ class DriverStep:
     def _chosen(self, state: DriverState, noise: Tensor | None) -> DriverState:
         """Returns the state of drivers whose window begins with their new parameters."""
         begun, count = self._begun, state.steps.shape[0]  # `len` would export it as a constant
-        base = None if begun.base is None else begun.base.expand(count, -1)
-        known = AgentState(
+        base = begun.base
+        if base is not None:
+            base = base.expand(count, -1)
+        before = AgentState(
             begun.network.expand(count),
             torch.arange(count, device=begun.network.device),
             state.network[None],
@@ -234,9 +253,41 @@ class DriverStep:
             begun.beyond.expand(count, -1),
             state.latent,
         )
-        chosen, after = self.agent.choose(History(*state.history.unbind(1)), known, noise)
+        history = dict(zip(self.signals, state.history.unbind(1), strict=True))
+        chosen, after = self.agent.choose(history, before, noise)
         return state._replace(
             parameters=chosen, network=after.state[0], latent=after.latent, score=after.score
+        )
+
+    def _frame(
+        self,
+        ego: Motion,
+        leader: Motion,
+        gap: Tensor,
+        surroundings: Mapping[str, Tensor] | None,
+    ) -> Tensor:
+        """Returns the signals at one instant, `(D, g)`.
+
+        Raises:
+            DataError: a further signal is missing.
+        """
+        signals = [leader.speed, leader.acceleration, ego.speed, ego.acceleration, gap]
+        for signal in self.further_signals:
+            if surroundings is None or signal.name not in surroundings:
+                raise DataError(
+                    f"an input of the policy reads the signal '{signal.name}' ({signal.meaning},"
+                    f" {signal.unit or 'without a unit'}), which is not given; pass it in each step"
+                    f" as surroundings={{'{signal.name}': ...}}"
+                )
+            signals.append(surroundings[signal.name])
+        return torch.stack(signals, -1)
+
+    def _not_finite(self, frame: Tensor) -> str:
+        """Says which signal of a frame `(D, g)` is not finite, in words."""
+        driver, signal = (~frame.isfinite()).nonzero()[0].tolist()
+        return (
+            f"{self.signals[signal]} of driver {driver} is {float(frame[driver, signal]):g}; give a"
+            " number for each signal (m/s, m/s2, m), and gap=inf where nobody is ahead"
         )
 
     def _advanced(
@@ -262,26 +313,11 @@ def _as_known(ego: Motion, leader: Motion, gap: Tensor) -> tuple[Motion, Tensor]
     return Motion(speed, acceleration), torch.where(is_free, FREE_ROAD_M, gap)
 
 
-def _frame(ego: Motion, leader: Motion, gap: Tensor) -> Tensor:
-    """Returns the signals of `History` at one instant, `(D, 5)`."""
-    signals = History(leader.speed, leader.acceleration, ego.speed, ego.acceleration, gap)
-    return torch.stack(list(signals), -1)
-
-
 def _on_free_road(state: DriverState) -> Tensor:
     """Says who had nobody ahead at the last frame, bool `(D,)`."""
     return state.history[:, _GAP, -1] >= FREE_ROAD_M
 
 
-def _not_finite(frame: Tensor) -> str:
-    """Says which signal of a frame `(D, 5)` is not finite, in words."""
-    driver, signal = (~frame.isfinite()).nonzero()[0].tolist()
-    return (
-        f"{History._fields[signal]} of driver {driver} is {float(frame[driver, signal]):g}; give a"
-        " number for each signal (m/s, m/s2, m), and gap=inf where nobody is ahead"
-    )
-
-
-def _as_wide(drivers: Tensor, like: Tensor) -> Tensor:
+def _as_wide(drivers: Tensor, columns: Tensor) -> Tensor:
     """Returns a bool for each driver, `(D,)`, in as many dimensions as a tensor `(D, ...)`."""
-    return drivers.view(-1, *[1] * (like.dim() - 1))
+    return drivers.view(-1, *[1] * (columns.dim() - 1))

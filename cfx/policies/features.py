@@ -1,4 +1,4 @@
-"""Inputs of policies: recent states of leader and follower, one token per window; normalisation.
+"""Features that networks read: inputs of policies as one token per window, and normalisation.
 
 The token of a window holds the last `length` frames up to and including the window's first, so it
 never looks ahead. Shapes: f features of a token, N networks, B drivers of each, W windows.
@@ -6,100 +6,18 @@ never looks ahead. Shapes: f features of a token, N networks, B drivers of each,
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Mapping
-from typing import Literal, NamedTuple
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from typing import Literal
 
 import torch
 from torch import Tensor, nn
 
-from cfx.data.pairs import PairBatch
 from cfx.errors import nearest
+from cfx.policies.history import History
+from cfx.policies.inputs.base import PolicyInput
 
 Summary = Literal["frames", "last", "mean", "mean_std"]
 """What networks read of the frames of a window: all, the last, the mean, or mean and deviation."""
-
-
-class History(NamedTuple):
-    """Recent frames of leader and follower, oldest first; all `(*batch, length)`, SI units."""
-
-    leader_speed: Tensor
-    leader_acceleration: Tensor
-    follower_speed: Tensor
-    follower_acceleration: Tensor
-    gap: Tensor
-
-    @classmethod
-    def of(cls, batch: PairBatch) -> History:
-        """Returns all that was measured of P pairs, `(P, T)` each."""
-        return cls(
-            batch.leader_speed,
-            batch.leader_acceleration,
-            batch.follower_speed,
-            batch.follower_acceleration,
-            batch.gap,
-        )
-
-    def double(self) -> History:
-        """Returns the same signals in double precision."""
-        return History(*(signal.double() for signal in self))
-
-
-_STANDING = 1.0
-"""Speed in m/s below which time headway and inverse time to collision are taken at this speed: they
-have poles at 0."""
-
-_FRAME_S = 0.1
-"""Time between frames for which jerk is in m/s3; a network's scaler takes out what differs."""
-
-
-def _jerk(acceleration: Tensor) -> Tensor:
-    """Returns jerks `(*batch, length)` at 0.1 s; the first stands twice, and is 0 where alone."""
-    if acceleration.shape[-1] == 1:
-        return torch.zeros_like(acceleration)
-    difference = acceleration.diff(dim=-1)
-    return torch.cat([difference[..., :1], difference], -1) / _FRAME_S
-
-
-INPUTS: dict[str, Callable[[History], Tensor]] = {
-    "leader_speed": lambda h: h.leader_speed,
-    "leader_acceleration": lambda h: h.leader_acceleration,
-    "follower_speed": lambda h: h.follower_speed,
-    "follower_acceleration": lambda h: h.follower_acceleration,
-    "gap": lambda h: h.gap,
-    "relative_speed": lambda h: h.leader_speed - h.follower_speed,
-    "time_headway": lambda h: h.gap / h.follower_speed.clamp(min=_STANDING),
-    "inverse_time_to_collision": lambda h: (
-        (h.follower_speed - h.leader_speed) / h.gap.clamp(min=_STANDING)
-    ),
-    "follower_jerk": lambda h: _jerk(h.follower_acceleration),
-    "leader_jerk": lambda h: _jerk(h.leader_acceleration),
-}
-"""Signals that a policy may see, each `(*batch, length)`, in SI units. The gap is bumper to bumper;
-the relative speed is positive where it grows, the inverse time to collision where it shrinks."""
-
-SITUATION = (
-    "leader_speed",
-    "relative_speed",
-    "gap",
-    "time_headway",
-    "follower_acceleration",
-    "leader_acceleration",
-)
-"""The inputs with which closed-loop training works best."""
-
-MOTION = (*SITUATION, "follower_jerk", "leader_jerk")
-"""The situation and the jerks: for policies of smooth models that start from the driver's
-acceleration. The follower's jerk misleads where a model's acceleration jumps, as Krauss's does."""
-
-SPEEDS = ("leader_speed", "follower_speed")
-"""The paper's inputs."""
-
-INPUT_SETS: dict[str, tuple[str, ...]] = {
-    "situation": SITUATION,
-    "motion": MOTION,
-    "speeds": SPEEDS,
-}
-"""Inputs that go by one name: `policy.inputs=situation`."""
 
 
 def _summarised(values: Tensor, summary: Summary) -> list[Tensor]:
@@ -114,7 +32,7 @@ def _summarised(values: Tensor, summary: Summary) -> list[Tensor]:
 
 
 def named(
-    sets: Mapping[str, tuple[str, ...]], known: Collection[str], what: str
+    sets: Mapping[str, tuple[str, ...]], names: Callable[[], Collection[str]], what: str
 ) -> Callable[[object], object]:
     """Returns the check of a setting that is the name of a set, or a list of names and sets.
 
@@ -123,78 +41,67 @@ def named(
 
     Args:
         sets: names that stand for several.
-        known: what there is.
+        names: gives all that there are.
         what: one of them in words, such as `input`.
     """
 
     def check(value: object) -> object:
         if isinstance(value, str):
-            if value not in sets:
-                hint = nearest(value, [*sets, *known])
-                if value in known:
-                    hint = f" Write [{value}]."
-                raise ValueError(
-                    f"not a set of {what}s.{hint} Give {', '.join(sets)}, or a list of"
-                    f" {', '.join(known)}"
-                )
-            return sets[value]
-        if not isinstance(value, list | tuple) or not all(isinstance(one, str) for one in value):
+            return _names_of_set(value, sets, names(), what)
+        if not isinstance(value, list | tuple):
             return value
-        names: list[str] = []
-        for one in value:
-            names.extend(sets.get(one, (one,)))
-        for name in names:
-            if name not in known:
-                hint = nearest(name, known)
-                raise ValueError(f"unknown {what} '{name}'.{hint} Known: {', '.join(known)}")
-        if len(set(names)) != len(names):
-            raise ValueError(f"one {what} stands twice in {', '.join(names)}")
-        if not names and "none" not in sets:
-            raise ValueError(f"give at least one of {', '.join(known)}")
-        return tuple(names)
+        chosen: list[str] = []
+        for part in value:
+            if not isinstance(part, str):
+                return value  # the type of the setting says what is wrong
+            chosen.extend(sets.get(part, (part,)))
+        _require_known(chosen, names(), what)
+        if not chosen and "none" not in sets:
+            raise ValueError(f"give at least one of {', '.join(names())}")
+        return tuple(chosen)
 
     return check
 
 
-def token_width(names: tuple[str, ...], summary: Summary, length: int) -> int:
-    """Returns f where a token holds `length` frames."""
+def _names_of_set(
+    value: str, sets: Mapping[str, tuple[str, ...]], names: Collection[str], what: str
+) -> tuple[str, ...]:
+    """Returns the names that a set stands for; raises ValueError if there is no such set."""
+    if value in sets:
+        return sets[value]
+    hint = nearest(value, [*sets, *names])
+    if value in names:
+        hint = f" Write [{value}]."
+    raise ValueError(
+        f"not a set of {what}s.{hint} Give {', '.join(sets)}, or a list of {', '.join(names)}"
+    )
+
+
+def _require_known(chosen: Sequence[str], names: Collection[str], what: str) -> None:
+    """Raises ValueError for a name that is unknown or stands twice."""
+    for name in chosen:
+        if name not in names:
+            hint = nearest(name, names)
+            raise ValueError(f"unknown {what} '{name}'.{hint} Known: {', '.join(names)}")
+    if len(set(chosen)) != len(chosen):
+        raise ValueError(f"one {what} stands twice in {', '.join(chosen)}")
+
+
+def token_width(inputs: Sequence[object], summary: Summary, length: int) -> int:
+    """Returns f where a token holds `length` frames of some inputs, or of what they are called."""
     if summary == "frames":
-        return len(names) * length
+        return len(inputs) * length
     if summary == "mean_std":
-        return len(names) * 2
-    return len(names)
+        return len(inputs) * 2
+    return len(inputs)
 
 
-def tokens(history: History, names: tuple[str, ...], summary: Summary) -> Tensor:
+def tokens(history: History, inputs: Sequence[PolicyInput], summary: Summary) -> Tensor:
     """Returns tokens `(*batch, f)` of recent frames `(*batch, length)`."""
     features = []
-    for name in names:
-        features += _summarised(INPUTS[name](history), summary)
+    for policy_input in inputs:
+        features += _summarised(policy_input.values(history), summary)
     return torch.stack(features, dim=-1)
-
-
-def measured_history(batch: PairBatch, pair: Tensor, frame: Tensor, length: int) -> History:
-    """Returns the last measured frames up to a frame; the first stands for those before it.
-
-    Args:
-        batch: P pairs.
-        pair: which of them, `(*shape)`.
-        frame: `(*shape)`, or what broadcasts with it.
-        length: how many frames.
-
-    Returns:
-        Signals of `(*shape, length)`.
-    """
-    past = torch.arange(1 - length, 1, device=frame.device)
-    index = (frame[..., None] + past).clamp(min=0)
-    rows = pair[..., None]
-    return History(
-        batch.leader_speed[rows, index],
-        batch.leader_acceleration[rows, index],
-        batch.follower_speed[rows, index],
-        batch.follower_acceleration[rows, index],
-        batch.gap[rows, index],
-    )
 
 
 _LEAST_SCALE = 1e-6

@@ -22,7 +22,8 @@ import torch
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch
-from cfx.policies.features import History
+from cfx.data.signals import SIGNALS
+from cfx.policies.history import History, changed
 
 __all__ = [
     "FADED",
@@ -36,17 +37,20 @@ FADED = 2.5
 """Score from which on nothing is left of an agent's answer. Nearer bounds are worse: mixtures of an
 answer and the base can be worse than either, and just outside the answers are still good."""
 
-RANGE_SIGNALS = (
-    "follower_speed",
-    "follower_acceleration",
-    "leader_acceleration",
-    "relative_speed",
-    "log_gap",
-)
-"""The signals of a situation."""
+_WORDS = {
+    "follower_speed": ("speed", SIGNALS["follower_speed"].unit),
+    "follower_acceleration": ("acceleration", SIGNALS["follower_acceleration"].unit),
+    "leader_acceleration": ("leader's acceleration", SIGNALS["leader_acceleration"].unit),
+    "relative_speed": ("relative speed", SIGNALS["leader_speed"].unit),
+    "log_gap": ("gap", SIGNALS["gap"].unit),
+}
+"""The signals of a situation, what people call them, and the unit in which they are told.
 
-_WORDS = ("speed", "acceleration", "leader's acceleration", "relative speed", "gap")
-_UNITS = ("m/s", "m/s2", "m/s2", "m/s", "m")
+Further signals, such as rain, are not among them: a distance needs a covariance that is known.
+"""
+
+RANGE_SIGNALS = tuple(_WORDS)
+"""The signals of a situation."""
 
 _INSIDE = 0.995
 """Share of the situations learned from that lie inside."""
@@ -86,10 +90,10 @@ class ValidRange(NamedTuple):
     @classmethod
     def of(cls, situations: Sequence[Tensor]) -> ValidRange:
         """Measures situations `(S, f)` of each network, in double precision."""
-        found = []
+        measured = []
         for learned in situations:
-            found.append(_measured(learned.double()))
-        return cls(*(torch.stack(column) for column in zip(*found, strict=True)))
+            measured.append(_measured(learned.double()))
+        return cls(*(torch.stack(column) for column in zip(*measured, strict=True)))
 
     def score(self, situation: Tensor, network: Tensor) -> Tensor:
         """Returns how far outside situations lie, `(D,)`; up to 1 is inside.
@@ -130,14 +134,20 @@ class ValidRange(NamedTuple):
 
 def situation_of(history: History) -> Tensor:
     """Returns the situations at the last frame of histories `(*batch, L)`, `(*batch, f)`."""
-    return situations(History(*(signal[..., -1] for signal in history)))
+    return situations(changed(history, lambda signal: signal[..., -1]))
 
 
-def situations(h: History) -> Tensor:
+def situations(history: History) -> Tensor:
     """Returns situations `(*batch, f)` of signals `(*batch,)` each, SI units."""
-    relative_speed, log_gap = h.leader_speed - h.follower_speed, (h.gap.clamp(min=0.0) + 1.0).log()
-    acceleration, of_leader = h.follower_acceleration, h.leader_acceleration
-    return torch.stack([h.follower_speed, acceleration, of_leader, relative_speed, log_gap], -1)
+    speed = history["follower_speed"]
+    values = {
+        "follower_speed": speed,
+        "follower_acceleration": history["follower_acceleration"],
+        "leader_acceleration": history["leader_acceleration"],
+        "relative_speed": history["leader_speed"] - speed,
+        "log_gap": (history["gap"].clamp(min=0.0) + 1.0).log(),
+    }
+    return torch.stack([values[name] for name in RANGE_SIGNALS], -1)
 
 
 def weight_of_answer(score: Tensor) -> Tensor:
@@ -160,10 +170,12 @@ def recorded_quantiles(batch: PairBatch) -> dict[str, tuple[float, ...]]:
         "acceleration": batch.follower_acceleration[batch.mask],
         "time_gap": batch.gap[batch.mask][moves] / speed[moves],
     }
-    found: dict[str, tuple[float, ...]] = {}
+    quantiles: dict[str, tuple[float, ...]] = {}
     for name, values in signals.items():
-        found[name] = tuple(_quantiles(values, _RECORDED).tolist()) if len(values) else ()
-    return found
+        quantiles[name] = ()
+        if len(values):
+            quantiles[name] = tuple(_quantiles(values, _RECORDED).tolist())
+    return quantiles
 
 
 def share_in_words(valid_range: ValidRange, outside: int, steps: int, beyond: Tensor) -> str:
@@ -178,7 +190,9 @@ def share_in_words(valid_range: ValidRange, outside: int, steps: int, beyond: Te
     if outside == 0:
         return ""
     share = 100 * outside / steps
-    number = f"{share:.0f}" if share >= 1 else f"{share:.1g}"
+    number = f"{share:.1g}"
+    if share >= 1:
+        number = f"{share:.0f}"
     reason = in_words(valid_range, beyond)
     if reason:
         reason = f" ({reason})"
@@ -201,7 +215,8 @@ def in_words(valid_range: ValidRange, beyond: Tensor) -> str:
     bound = float(bounds[signal])
     if RANGE_SIGNALS[signal] == "log_gap":
         bound = float(torch.expm1(bounds[signal]))
-    return f"{_WORDS[signal]} {side} {bound:.3g} {_UNITS[signal]}"
+    words, unit = _WORDS[RANGE_SIGNALS[signal]]
+    return f"{words} {side} {bound:.3g} {unit}"
 
 
 def _measured(learned: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:

@@ -50,7 +50,13 @@ SAYS_TOO_MUCH = (
 
 
 class OutputSettings(Settings):
-    """Where a job's folder is copied to."""
+    """What a job prints, and where its folder is copied to."""
+
+    verbose: bool = Field(
+        False,
+        description="print all that was measured, not one table and one sentence; --verbose says"
+        " the same",
+    )
 
     url: str | None = Field(
         None,

@@ -296,7 +296,7 @@ class Result:
             return ()
         baselines: list[str] = []
         for method in ("fixed", *self.methods):
-            was_compared = f"{improvement_key(method, scope)}/mean" in self.metrics
+            was_compared = f"{improvement_key(method, scope)}/geometric" in self.metrics
             is_new = method not in {*baselines, "policy"}
             if was_compared and is_new and method in self.methods:
                 baselines.append(method)
@@ -345,17 +345,17 @@ class Result:
             scope: `test`; `steady`, after its first seconds; or `full_trajectory`.
 
         Returns:
-            mean, trimmed_mean, median, ci95_low, ci95_high, win_rate, p_value; see
-            `cfx.evaluation.statistics.Improvement`.
+            geometric, ci95_low, ci95_high, ratio_of_means, median, win_rate, p_value, mean_ratio,
+            trimmed_mean_ratio, drivers; see `cfx.evaluation.statistics.Improvement`.
 
         Raises:
             DataError: they were not compared.
         """
         prefix = improvement_key(over, scope)
-        if f"{prefix}/mean" not in self.metrics:
+        if f"{prefix}/geometric" not in self.metrics:
             compared = []
             for method in METHODS:
-                if f"{improvement_key(method, scope)}/mean" in self.metrics:
+                if f"{improvement_key(method, scope)}/geometric" in self.metrics:
                     compared.append(method)
             raise DataError(
                 f"improvement(over={over!r}, scope={scope!r}): the policy was not compared with it;"
@@ -367,7 +367,10 @@ class Result:
     def statistics(self, baseline: str, scope: str = _TEST) -> Improvement:
         """Returns the improvement over a baseline; NaN where a statistic is not known."""
         prefix = improvement_key(baseline, scope)
-        statistics = {name: self.metrics.get(f"{prefix}/{name}", math.nan) for name in STATISTICS}
+        statistics: dict[str, float] = {}
+        for name in STATISTICS:
+            if name != "drivers":
+                statistics[name] = self.metrics.get(f"{prefix}/{name}", math.nan)
         drivers = self._improved_drivers(baseline, scope)
         undefined = self.pairs["pair_id"].nunique() - len(drivers) if len(self.pairs) else 0
         return Improvement(
@@ -384,7 +387,7 @@ class Result:
         if baseline not in errors or "policy" not in errors:
             return pd.Series(dtype=object)
         before, after = errors[baseline], errors["policy"]
-        is_defined = np.isfinite(before) & np.isfinite(after) & (before > 0)
+        is_defined = np.isfinite(before) & np.isfinite(after) & (before > 0) & (after > 0)
         drivers = rows.drop_duplicates("pair_id").set_index("pair_id")["driver"]
         return drivers[drivers.index.isin(errors.index[is_defined])]
 
@@ -518,8 +521,11 @@ class Result:
 
     def __repr__(self) -> str:
         """Returns two lines for people: what it is and how well it drives, and where it lies."""
-        chosen = [f"model={self.policy.model_node['name']}"]
-        chosen.append(f"policy={self.policy.policy_node['name']}")
+        model, policy = self.component("model"), self.component("policy")
+        if not model:  # of a ready-made policy the folder holds no configuration
+            model = str(self.policy.model_node["name"])
+            policy = str(self.policy.policy_node["name"])
+        chosen = [f"model={model}", f"policy={policy}"]
         if len(self.pairs):
             chosen.append(f"{self.pairs['pair_id'].nunique()} pairs")
         _, words = headline(self.metrics)

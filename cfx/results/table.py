@@ -73,6 +73,8 @@ class ResultTable(Component):
         always: every job leaves it, whatever its protocol; a report says where it is missing.
         tracked: how MLflow keeps it too: as a `file`; as a `table` that its pages show besides; or
             not at all, "".
+        always_printed: what it prints is what the job was asked for, such as forecasts; other
+            tables print where the user asks for all (`output.verbose`).
         large: a job that writes it keeps it nowhere else: it may be more than fits into memory, and
             figures do not see it.
     """
@@ -84,6 +86,7 @@ class ResultTable(Component):
     order: ClassVar[int] = 1000
     always: ClassVar[bool] = False
     tracked: ClassVar[Literal["file", "table", ""]] = "file"
+    always_printed: ClassVar[bool] = False
     large: ClassVar[bool] = False
 
     def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:

@@ -385,6 +385,7 @@ class Fits(ResultTable):
         " how well driver-specific ones are known"
     )
     order = 210
+    always_printed = True
     columns = (
         PAIR,
         Column("driver", "", "the follower of the pair", "text", required=False),
@@ -581,6 +582,7 @@ class Past(ResultTable):
     meaning = "what each driver's past says of the policy (`protocol.combine`, `protocol=transfer`)"
     suffix = ".csv"
     order = 115
+    always_printed = True
     columns = (
         PAIR,
         DRIVER,

@@ -40,7 +40,7 @@ result = cfx.run(
 #
 # For a driver that nobody has recorded there are no own parameters, so the fair baseline is
 # `population`: one pooled set, calibrated on the same training drivers, on full trajectories. The
-# interval is a bootstrap over drivers, because frames of one driver say little about the next.
+# interval is over drivers, because frames of one driver say little about the next.
 
 # %%
 metrics = result.metrics
@@ -48,7 +48,7 @@ key = "full_trajectory/rmse_improvement/population"
 print(f"pooled {metrics['full_trajectory/rmse_speed/population']:.3f} m/s")
 print(f"policy {metrics['full_trajectory/rmse_speed/policy']:.3f} m/s")
 low, high = metrics[f"{key}/ci95_low"], metrics[f"{key}/ci95_high"]
-print(f"improvement {metrics[f'{key}/mean']:+.1%} (95 % interval {low:+.1%} to {high:+.1%})")
+print(f"improvement {metrics[f'{key}/geometric']:+.1%} (95 % interval {low:+.1%} to {high:+.1%})")
 
 # %% [markdown]
 # Does the interval exclude zero? Run it again with `seed=1`: other folds, other networks. With

@@ -27,8 +27,9 @@ from cfx.calibration.objectives import FrameValues, Objective
 from cfx.calibration.rmse import SpeedRmse
 from cfx.calibration.shards import Solver
 from cfx.core import registry
-from cfx.data.pairs import SIGNALS, Pair, PairBatch, PairSet
-from cfx.data.signals import resampled
+from cfx.data.pairs import Pair, PairBatch, PairSet
+from cfx.data.resampling import resampled
+from cfx.data.signals import RECORDED as SIGNALS
 from cfx.models.base import DrivingModel, Leader
 from cfx.simulation.rollout import MemoryStepper, simulate_follower
 from cfx.simulation.synthetic import SyntheticDataset

@@ -23,7 +23,8 @@ import pandas as pd
 
 from cfx.core import registry
 from cfx.data.base import Dataset
-from cfx.data.pairs import SIGNALS, Pair, PairSet
+from cfx.data.pairs import Pair, PairSet
+from cfx.data.signals import RECORDED
 from cfx.data.tidy import TidyDataset
 from cfx.errors import CfxError
 from tests.data.layouts import write_fcd
@@ -409,7 +410,7 @@ def chosen(data: Path, recording: str) -> list[Pair]:
     ).load()
     cut = []
     for pair in pairs.pairs[:: max(1, len(pairs) // PAIRS)][:PAIRS]:
-        cut.append(replace(pair, **{one: getattr(pair, one)[:frames] for one in SIGNALS}))
+        cut.append(replace(pair, **{one: getattr(pair, one)[:frames] for one in RECORDED}))
     return cut
 
 

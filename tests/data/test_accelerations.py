@@ -12,14 +12,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.signal import lfilter
 
-from cfx.data.files import Floats
-from cfx.data.pairs import PairSet
-from cfx.data.signals import (
+from cfx.data.accelerations import (
     RECORDED,
     best_average,
     smoothed_twice,
     with_usable_accelerations,
 )
+from cfx.data.files import Floats
+from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, write_tidy
 from tests.drives import straight_pairs
 

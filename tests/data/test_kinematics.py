@@ -12,10 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cfx.data.kinematics import contradiction, contradictions, typical_contradiction
-from cfx.data.pairs import SIGNALS, Pair, PairSet
+from cfx.data.pairs import Pair, PairSet
 from cfx.data.plausible import doubts
+from cfx.data.signals import RECORDED
 from cfx.data.tidy import TidyDataset
-from cfx.data.tracks import driven
+from cfx.data.tracks import distance_driven
 from cfx.models.krauss import Krauss
 from tests.checkout import ROOT
 from tests.drives import straight_pairs, wavy_pairs
@@ -35,7 +36,7 @@ def times(factor: float, *signals: str, pair: Pair = PAIRS[0]) -> Pair:
 def by_gap(pair: Pair, speed: float, gap: float) -> Pair:
     """Returns what a file of gaps and speeds gives, each with a factor."""
     leader, follower = pair.leader_speed * speed, pair.follower_speed * speed
-    rear = driven(leader, pair.dt)
+    rear = distance_driven(leader, pair.dt)
     return replace(
         pair,
         leader_length=0.0,
@@ -161,7 +162,7 @@ def test_differences_of_coarse_speeds_do_not_contradict_them() -> None:
             speed = 12.0 + 2.0 * np.sin(0.5 * time + number)
             signals[f"{who}_speed"] = speed
             signals[f"{who}_acceleration"] = np.gradient(speed)
-            signals[f"{who}_position"] = ahead + driven(speed, 1.0)
+            signals[f"{who}_position"] = ahead + distance_driven(speed, 1.0)
         pairs.append(replace(pair, pair_id=f"p{number}", dt=1.0, **signals))
     assert typical_contradiction(PairSet(tuple(pairs), "made up")) is None
     wrong = [times(1.2, *ACCELERATIONS, pair=pair) for pair in pairs]
@@ -184,7 +185,7 @@ THINNED = "openacc_ispra_low_speed_pairs.parquet"
 
 def every(step: int, pair: Pair) -> Pair:
     """Returns a pair of which every so many frames are kept."""
-    signals = {name: getattr(pair, name)[::step] for name in SIGNALS}
+    signals = {name: getattr(pair, name)[::step] for name in RECORDED}
     return replace(pair, dt=pair.dt * step, **signals)
 
 

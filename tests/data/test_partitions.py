@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.dataset
@@ -15,7 +16,6 @@ from cfx.app.sweep.folder import fingerprint
 from cfx.data import tidy
 from cfx.data.describe import describe
 from cfx.data.pairs import PairSet
-from cfx.data.table import Layout
 from cfx.data.tidy import TidyDataset, read_tidy, write_tidy
 from cfx.errors import DataError
 from tests.drives import straight_pairs
@@ -77,9 +77,9 @@ def test_a_job_of_a_sweep_is_done_again_when_a_file_of_the_folder_has_changed(fo
 def test_other_recordings_are_not_read(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     read: list[Path] = []
 
-    def counted(path: Path, layout: Layout) -> PairSet:
+    def counted(path: Path, *further: Any) -> PairSet:
         read.append(path)
-        return read_tidy(path, layout)
+        return read_tidy(path, *further)
 
     monkeypatch.setattr(tidy, "read_tidy", counted)
     found = TidyDataset(path=folder, recording="us 101", min_duration=0).load()

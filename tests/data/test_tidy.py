@@ -13,7 +13,8 @@ import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
-from cfx.data.pairs import SIGNALS, Pair, PairSet
+from cfx.data.pairs import Pair, PairSet
+from cfx.data.signals import RECORDED
 from cfx.data.tidy import TidyDataset, pairs_from_frame, read_tidy, write_tidy
 from cfx.errors import DataError, OutputError
 from cfx.simulation.synthetic import SyntheticDataset
@@ -24,7 +25,7 @@ def same(one: PairSet, other: PairSet) -> None:
     for a, b in zip(one, other, strict=True):
         for f in fields(Pair):
             x, y = getattr(a, f.name), getattr(b, f.name)
-            if f.name in SIGNALS:
+            if f.name in RECORDED:
                 np.testing.assert_array_equal(x, y, strict=True)
             elif f.name == "truth":
                 assert set(x) == set(y)

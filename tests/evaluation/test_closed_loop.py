@@ -233,9 +233,7 @@ def test_the_table_says_what_the_loops_did() -> None:
         {},
         (0.3, 0.7),
     )
-    result = evaluate(
-        ComparedPairs(pairs, batch, first, style), {"test": loops}, model.space, seed=0
-    )
+    result = evaluate(ComparedPairs(pairs, batch, first, style), {"test": loops}, model.space)
     table = result.table.set_index(["pair_id", "method"])
     assert table.loc[("p0", "policy"), "rmse_speed"] == pytest.approx(0, abs=1e-9)
     assert table.loc[("p1", "policy"), "improvement"] == pytest.approx(1)
@@ -270,7 +268,6 @@ def test_a_collision_is_counted() -> None:
         ComparedPairs(pairs, batch, first, style),
         {"test": {"default": loop, "fixed": loop, "policy": crashed}},
         model.space,
-        seed=0,
     )
     assert result.metrics()["collisions/policy"] == 1
     assert result.metrics()["collisions/fixed"] == 0

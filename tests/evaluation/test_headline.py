@@ -7,10 +7,10 @@ import math
 from cfx.evaluation.headline import fitted_errors, headline, main_error
 
 METRICS = {
-    "rmse_improvement/mean": 0.21584,
+    "rmse_improvement/geometric": 0.21584,
     "rmse_improvement/ci95_low": 0.1688,
     "rmse_improvement/ci95_high": 0.2621,
-    "steady/rmse_improvement/mean": 0.13,
+    "steady/rmse_improvement/geometric": 0.13,
     "rmse_speed/policy": 0.58432,
     "rmse_speed/fixed": 0.7351,
     "rmse_speed/population": 0.6861,
@@ -33,28 +33,30 @@ def test_an_improvement_is_in_percent_with_its_interval() -> None:
     }
 
 
-def test_a_mean_of_ratios_that_the_means_contradict_is_told_with_theirs() -> None:
-    """A few drivers whose baseline is nearly perfect outweigh all others in a mean of ratios."""
+def test_mean_errors_that_contradict_are_told() -> None:
+    """A few drivers with large errors outweigh all others in a ratio of mean errors."""
     metrics = {
-        "rmse_improvement/mean": -0.014,
+        "rmse_improvement/geometric": -0.014,
+        "rmse_improvement/ratio_of_means": 0.124,
+        "rmse_improvement/drivers": 5.0,
         "rmse_speed/policy": 0.624,
         "rmse_speed/fixed": 0.712,
     }
     _, words = headline(metrics)
     assert words == (
-        "-1.4 % over driver-specific, mean of the pairs' improvements; of the mean RMSE +12.4 %;"
+        "-1.4 % over driver-specific, of the mean errors +12.4 %, 5 drivers;"
         " RMSE of speed 0.624 m/s (driver-specific 0.712 m/s)"
     )
 
 
 def test_without_driver_specific_parameters_it_is_over_pooled_ones() -> None:
-    metrics = {"full_trajectory/rmse_improvement/population/mean": 0.1}
+    metrics = {"full_trajectory/rmse_improvement/population/geometric": 0.1}
     words = "+10.0 % over pooled on full trajectories"
     assert headline(metrics) == ({"improvement_percent": 10.0}, words)
 
 
 def test_a_baseline_whose_error_is_not_known_has_no_error_in_the_words() -> None:
-    _, words = headline({"rmse_improvement/mean": 0.1, "rmse_speed/policy": 0.5})
+    _, words = headline({"rmse_improvement/geometric": 0.1, "rmse_speed/policy": 0.5})
     assert words == "+10.0 % over driver-specific; RMSE of speed 0.500 m/s"
 
 
@@ -88,6 +90,6 @@ def test_what_is_asked_first_of_the_judged_method_has_no_group() -> None:
 
 
 def test_what_is_not_defined_is_not_said() -> None:
-    metrics = {"rmse_improvement/mean": math.nan, "rmse_speed/policy": math.nan}
+    metrics = {"rmse_improvement/geometric": math.nan, "rmse_speed/policy": math.nan}
     assert headline(metrics) == ({}, "")
     assert headline({}) == ({}, "calibration")

@@ -74,7 +74,7 @@ def test_a_shard_holds_nothing_of_the_others(monkeypatch: pytest.MonkeyPatch) ->
         rows = len(one.followers.batch)
         assert one.followers.batch.leader_speed.untyped_storage().nbytes() == rows * row
         assert one.first.untyped_storage().nbytes() == rows * one.first.itemsize
-        assert len(one.agent.names) == len(one.agent.scaler.mean) == rows
+        assert len(one.agent.names) == len(one.agent.core.scaler.mean) == rows
         assert not one.agent.trained_on.pairs
 
 

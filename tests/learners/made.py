@@ -156,9 +156,9 @@ def module_with(
     return RolloutModule(TrainingShard(settings, policy or gru(), data, dataset, errors, weights))
 
 
-def module_of(data: TrainingData, **options: Any) -> RolloutModule:
+def module_of(data: TrainingData, policy: Policy | None = None, **options: Any) -> RolloutModule:
     """Returns a module whose networks answer at random, so that they do something."""
-    policy, settings = gru(), RolloutSettings(**(QUICK | options))
+    policy, settings = policy or gru(), RolloutSettings(**(QUICK | options))
     generator = torch.Generator().manual_seed(0)
     head = head_class(settings.head).for_model(data.simulator.model)
     dataset = RolloutDataset.of(data, policy, head, settings, generator)
@@ -166,7 +166,7 @@ def module_of(data: TrainingData, **options: Any) -> RolloutModule:
     network = policy.build(dataset.scaler.mean.shape[-1], blank[0], blank, generator)
     with torch.no_grad():
         network.get_parameter("w_out").uniform_(-1.0, 1.0, generator=generator)
-    return module_with(network.to(data.device), dataset, data, settings)
+    return module_with(network.to(data.device), dataset, data, settings, policy)
 
 
 def batch_of(

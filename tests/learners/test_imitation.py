@@ -18,8 +18,8 @@ from cfx.models.krauss import Krauss
 from cfx.policies.checkpoint import load_agent, save_agent
 from cfx.policies.context import DriverContext
 from cfx.policies.core import group_by
-from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
+from cfx.policies.history import measured_history
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split, Windows, WindowSettings
 from cfx_contracts import check_contract
@@ -148,7 +148,7 @@ def test_a_saved_policy_of_offsets_answers_the_same(tmp_path: Path) -> None:
     agent = replace(agent, model_node={"name": "krauss"}, policy_node={"name": "gru"})
     save_agent(agent, tmp_path)
     again = load_agent(tmp_path)
-    assert again.head.name == "offset"
+    assert again.core.head.name == "offset"
     history = measured_history(data.batch, torch.arange(3), torch.full((3,), 50), SETTINGS.length)
     answers = []
     for one in (agent, again):

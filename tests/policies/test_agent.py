@@ -9,7 +9,7 @@ from cfx.data.pairs import PairBatch
 from cfx.errors import DataError
 from cfx.models.krauss import Krauss
 from cfx.policies.context import DriverContext
-from cfx.policies.features import measured_history
+from cfx.policies.history import changed, measured_history
 from tests.agents import adaptive
 from tests.drives import wavy_pairs
 
@@ -31,7 +31,7 @@ def test_the_grid_and_drivers_in_any_order_get_the_same_parameters(offsets: bool
     found, after = agent.act(history(50), state)
     core = agent.core
     base = core.head.space.to_unit(TRUE)[None]
-    grid = type(history(50))(*(signal[None] for signal in history(50)))
+    grid = changed(history(50), lambda signal: signal[None])
     initial = core.network.initial_state(1, 3)
     features = torch.cat([core.encode(grid), core.condition(base, None)], -1)
     answer, grid_after = core.answer(features, initial)

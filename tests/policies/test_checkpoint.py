@@ -15,7 +15,7 @@ from cfx.models.krauss import Krauss
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent, TrainedOn
 from cfx.policies.context import ContextRule, DriverContext
-from cfx.policies.features import measured_history
+from cfx.policies.history import measured_history
 from tests.agents import adaptive
 from tests.drives import wavy_pairs
 
@@ -27,7 +27,7 @@ def chosen(agent: Agent) -> torch.Tensor:
     true = torch.tensor([[1.5, 0.1], [2.5, 0.4]], dtype=torch.float64)
     batch = PairBatch.of(wavy_pairs(Krauss(), true, frames=120))
     until = torch.tensor([60, 80])
-    base = true if agent.head.needs_base else None
+    base = true if agent.core.head.needs_base else None
     state = agent.begin(torch.zeros(2, dtype=torch.int64), DriverContext(base))
     state = agent.burn_in(batch, until, state)
     now = measured_history(batch, torch.arange(2), until, agent.windows.length)

@@ -24,10 +24,13 @@ from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
 from cfx.policies.context import DriverContext
 from cfx.policies.driver_features import DRIVER_FEATURES, LEAST, MOVING, measure
-from cfx.policies.features import History, measured_history
 from cfx.policies.gru import GruPolicy
+from cfx.policies.history import measured_history
+from cfx.policies.known_drivers import driver_features_of
+from cfx.policies.prediction import predict_frame
 from tests.agents import adaptive
 from tests.drives import straight_pairs, wavy_pairs
+from tests.histories import observed
 
 ALL = tuple(DRIVER_FEATURES)
 PARAMETERS = torch.tensor([[1.0, 0.1], [1.8, 0.5], [3.0, 0.4]]).double()
@@ -128,7 +131,7 @@ def one_that_knows() -> Agent:
 
 
 def first_answer(policy: Agent, driver_features: list[float] | None) -> list[float]:
-    now = History(
+    now = observed(
         *(
             torch.full((1, policy.windows.length), value).double()
             for value in (8.0, 0.1, 9.0, -0.2, 15.0)
@@ -157,7 +160,7 @@ def test_a_saved_policy_uses_the_same_driver_features(tmp_path: Path) -> None:
         checkpoint.load_agent(tmp_path),
         checkpoint.load_agent(tmp_path).for_unseen_drivers(),
     ):
-        now = History(
+        now = observed(
             *(torch.full((1, 5), value).double() for value in (8.0, 0.1, 9.0, -0.2, 15.0))
         )
         network = torch.tensor([len(again.names) - 1])
@@ -173,13 +176,13 @@ def test_a_table_is_answered_with_its_drivers_features(tmp_path: Path) -> None:
     policy = adaptive({"name": "krauss"}, driver_features=("time_headway", "response_time"))
     until, network = BATCH.lengths - 1, torch.zeros(3, dtype=torch.long)
     chosen = {}
-    for driver_features in (policy.driver_features_of(BATCH, until), None):
+    for driver_features in (driver_features_of(policy, BATCH, until), None):
         state = policy.burn_in(
             BATCH, until, policy.begin(network, DriverContext(None, driver_features))
         )
         now = measured_history(BATCH, torch.arange(3), until, policy.windows.length)
         chosen[driver_features is None] = policy.act(now, state)[0][:, 0].tolist()
-    found = policy.predict_frame(table)["t_r"].tolist()
+    found = predict_frame(policy, table)["t_r"].tolist()
     assert found == pytest.approx(chosen[False], rel=1e-6)
     assert found != pytest.approx(chosen[True], rel=1e-3)
 
@@ -188,15 +191,15 @@ def test_the_history_that_is_observed_is_the_history_that_is_measured() -> None:
     policy, until = one_that_knows(), torch.tensor([290, 290, 290])
     names = ("time_headway", "acceleration")
     torch.testing.assert_close(
-        policy.driver_features_of(BATCH, until, until - 210), measured(BATCH, 80, 290, names)
+        driver_features_of(policy, BATCH, until, until - 210), measured(BATCH, 80, 290, names)
     )
     torch.testing.assert_close(
-        policy.driver_features_of(BATCH, until), measured(BATCH, 0, 290, names)
+        driver_features_of(policy, BATCH, until), measured(BATCH, 0, 290, names)
     )
-    nothing = policy.driver_features_of(BATCH, until, until)
+    nothing = driver_features_of(policy, BATCH, until, until)
     assert nothing is not None
     assert bool(nothing.isnan().all())
-    assert adaptive({"name": "krauss"}).driver_features_of(BATCH, until) is None
+    assert driver_features_of(adaptive({"name": "krauss"}), BATCH, until) is None
 
 
 def test_an_unknown_driver_feature_is_refused() -> None:

@@ -5,10 +5,12 @@ from __future__ import annotations
 import pytest
 import torch
 
+from cfx.data.signals import OBSERVED
 from cfx.errors import ConfigError
 from cfx.policies.base import Policy
-from cfx.policies.features import INPUT_SETS, INPUTS, History, Scaler, token_width, tokens
+from cfx.policies.features import Scaler, token_width, tokens
 from cfx.policies.gru import GruPolicy
+from cfx.policies.inputs import INPUT_SETS, policy_inputs
 from cfx.policies.lstm import LstmPolicy
 from cfx.policies.recurrent import RecurrentNetwork
 from cfx_contracts import check_contract
@@ -67,11 +69,11 @@ def test_an_acting_bias_tells_acting_from_observing_and_begins_without_effect(
 
 
 def test_tokens_have_the_declared_width_and_are_finite_at_standstill() -> None:
-    history = History(*(torch.zeros((2, 5)) for _ in range(5)))
+    history = {name: torch.zeros((2, 5)) for name in OBSERVED}
+    inputs = policy_inputs((*INPUT_SETS["motion"], "inverse_time_to_collision", "follower_speed"))
     for summary in ("frames", "last", "mean", "mean_std"):
-        names = tuple(INPUTS)
-        out = tokens(history, names, summary)
-        assert out.shape == (2, token_width(names, summary, 5))
+        out = tokens(history, inputs, summary)
+        assert out.shape == (2, token_width(inputs, summary, 5))
         assert bool(out.isfinite().all())
 
 

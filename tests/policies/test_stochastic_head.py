@@ -20,10 +20,11 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent, AgentState
-from cfx.policies.features import History
 from cfx.policies.heads.stochastic import NOISE_SCALE, PARAMETER_TIME, StochasticHead
+from cfx.policies.history import History
 from cfx.policies.valid_range import ValidRange
 from tests.agents import adaptive
+from tests.histories import observed
 
 WINDOW_S = 0.5
 HEAD = StochasticHead.for_model(Krauss())
@@ -59,7 +60,7 @@ def logits(values: Tensor) -> Tensor:
 
 def steady(count: int, length: int = 5) -> History:
     signals = (9.0, 0.0, 9.0, 0.1, 20.0)
-    return History(*(torch.full((count, length), value).double() for value in signals))
+    return observed(*(torch.full((count, length), value).double() for value in signals))
 
 
 # ---- the acceleration
@@ -89,13 +90,13 @@ def test_the_jerk_is_measured_between_the_last_two_frames_and_bounded() -> None:
     blank = torch.zeros((3, 5)).double()
     acceleration = blank.clone()
     acceleration[:, -1] = torch.tensor([0.1, -0.05, 2.0])
-    history = History(blank, blank, blank, acceleration, blank)
+    history = observed(blank, blank, blank, acceleration, blank)
     found = HEAD.measured(chosen, history, 0.1)
     assert found[:, column(JERK.name)].tolist() == pytest.approx([1.0, -0.5, JERK.high])
     others = torch.arange(chosen.shape[-1]) != column(JERK.name)
     assert torch.equal(found[:, others], chosen[:, others])
     first = blank[:, :1]
-    one = History(first, first, first, first, first)
+    one = observed(first, first, first, first, first)
     assert torch.equal(HEAD.measured(chosen, one, 0.1), chosen)
 
 
@@ -216,7 +217,7 @@ def act(agent: Agent, state: AgentState, seed: int | None) -> tuple[Tensor, Agen
 
 def test_an_agent_draws_only_from_a_generator_and_the_same_from_the_same_seed() -> None:
     agent = adaptive(KRAUSS, stochastic=True)
-    assert agent.is_stochastic
+    assert agent.core.head.is_stochastic
     state = agent.begin(torch.zeros(3, dtype=torch.int64))
     centre, after = act(agent, state, None)
     assert torch.equal(act(agent, state, None)[0], centre)

@@ -9,9 +9,10 @@ import torch
 
 from cfx.policies import valid_range
 from cfx.policies.context import DriverContext
-from cfx.policies.features import History
+from cfx.policies.history import History
 from cfx.policies.valid_range import FADED, ValidRange, share_in_words, situations, weight_of_answer
 from tests.agents import adaptive
+from tests.histories import observed
 
 
 def learned(count: int = 4000) -> torch.Tensor:
@@ -22,7 +23,7 @@ def learned(count: int = 4000) -> torch.Tensor:
     speed = 15.0 * lots[0]
     gap = 2.0 + 1.5 * speed + noise[0].abs()
     leader = (speed + 0.5 * noise[0], 0.5 * noise[2])
-    return situations(History(*leader, speed, 0.5 * noise[1], gap))
+    return situations(observed(*leader, speed, 0.5 * noise[1], gap))
 
 
 RANGE = ValidRange.of([learned()])
@@ -32,14 +33,14 @@ ONE = torch.zeros(1, dtype=torch.int64)
 def situation(speed: float, gap: float, relative: float = 0.0) -> torch.Tensor:
     values = [speed + relative, 0.0, speed, 0.0, gap]
     signals = (torch.tensor([value], dtype=torch.float64) for value in values)
-    return situations(History(*signals))
+    return situations(observed(*signals))
 
 
 def history(speed: float, gap: float) -> History:
     def frames(value: float) -> torch.Tensor:
         return torch.full((1, 5), value, dtype=torch.float64)
 
-    return History(frames(speed), frames(0.0), frames(speed), frames(0.0), frames(gap))
+    return observed(frames(speed), frames(0.0), frames(speed), frames(0.0), frames(gap))
 
 
 def test_nearly_all_that_was_learned_from_is_inside() -> None:

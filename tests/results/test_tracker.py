@@ -31,6 +31,7 @@ from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler, token_width
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads.base import DirectHead
+from cfx.policies.prediction import predict_frame
 from cfx.results import provenance
 from cfx.results.config import JobConfig
 from cfx.results.mlflow.store import download_run, quiet, translate_errors
@@ -447,7 +448,7 @@ def test_a_logged_policy_loads_again_and_predicts_the_same(
         run.log_policy(saved_policy.folder, saved_policy.pairs)
     (output,) = client.get_run(run.run_id).outputs.model_outputs
     assert run.model_uri == f"models:/{output.model_id}"
-    expected = saved_policy.policy.predict_frame(saved_policy.frame)
+    expected = predict_frame(saved_policy.policy, saved_policy.frame)
     with quiet():
         import mlflow
 
@@ -481,9 +482,9 @@ def test_a_job_comes_back_from_its_run(
         run.log_files([tmp_path / "metrics.json"])
     folder = download_run(run.run_id, uri)
     assert (folder / "metrics.json").read_text() == "{}"
-    expected = saved_policy.policy.predict_frame(saved_policy.frame)
+    expected = predict_frame(saved_policy.policy, saved_policy.frame)
     pd.testing.assert_frame_equal(
-        checkpoint.load_agent(folder / "policy").predict_frame(saved_policy.frame), expected
+        predict_frame(checkpoint.load_agent(folder / "policy"), saved_policy.frame), expected
     )
     for wrong, message in (
         ("nothing", "neither a job's output folder nor the id"),

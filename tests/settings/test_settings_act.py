@@ -42,6 +42,7 @@ EXCEPTIONS = {
     "model.parameters.emergencyDecel.default": "no driver here has to brake so hard",
     "data.check": "recordings that contradict themselves are refused; these do not",
     "data.min_duration": "all of these pairs are longer",
+    "data.inputs": "inputs of plugins alone read further signals; tests of surroundings read them",
     "data.site": "a name",
     "data.vehicle": "a name",
     "protocol.run": "another job's folder",

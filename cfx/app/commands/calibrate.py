@@ -35,6 +35,7 @@ class CalibrateCommand(Command):
         parser.add_argument(
             "-m", "--multirun", action="store_true", help="a job for each of model=idm,krauss"
         )
+        parser.add_argument("--verbose", action="store_true", help="print all that was measured")
         return parser
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
@@ -44,6 +45,8 @@ class CalibrateCommand(Command):
         from cfx.app import application
 
         arguments = overrides_of(options.words)
+        if options.verbose:
+            arguments.append("output.verbose=true")
         if options.multirun:
             arguments = ["--multirun", *arguments]
         return application.start(arguments)

@@ -98,7 +98,8 @@ def show(kind: str, name: str) -> None:
         print(f"From its module: {of_module}\n")
     if entry.kind == "objective":
         print(f"Unit: {cls.unit or 'none'}\n")
-    about = {"model": _parameters, "metric": _metric, "table": _columns}.get(entry.kind)
+    tables = {"model": _parameters, "metric": _metric, "table": _columns, "input": _signals}
+    about = tables.get(entry.kind)
     if about is not None:
         print_table(about(cls))
     title = f"Settings (set with {group}.SETTING=VALUE)"
@@ -128,6 +129,8 @@ def _use(entry: registry.Entry, cls: Any) -> str:
     if entry.kind == "metric":
         who = "Every job" if entry.distribution == OWN else f"A job with metrics=[own,{name}]"
         return f"{who} measures it; with {kind.call(name)} no others but those that a job needs."
+    if entry.kind == "input":
+        return f"Choose it with policy.inputs=[situation,{name}], beside the usual ones."
     return f"Choose it with {kind.call(name)}."
 
 
@@ -145,6 +148,15 @@ def _columns(cls: Any) -> Table:
     rows.columns[0].no_wrap = True
     for column in cls.columns:
         rows.add_row(column.name, column.unit, column.dtype, column.meaning)
+    return rows
+
+
+def _signals(cls: Any) -> Table:
+    """Returns the signals that an input of policies reads, and what it makes of them."""
+    rows = blank_table("signal", "unit", "column", "meaning", title=f"{cls.meaning} [{cls.unit}]")
+    rows.columns[0].no_wrap = True
+    for signal in cls.signals:
+        rows.add_row(signal.name, signal.unit, signal.column, signal.meaning)
     return rows
 
 

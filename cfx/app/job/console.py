@@ -22,7 +22,7 @@ from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import scope_label
-from cfx.figures.wording import few_drivers, short_label
+from cfx.figures.wording import plural, short_label
 from cfx.results.result import Result
 from cfx.results.table import ResultTable, installed
 from cfx.simulation.trajectory import TRANSIENT_S
@@ -31,31 +31,43 @@ if TYPE_CHECKING:
     from cfx.results.tracker import Tracker
 
 
-def report(result: Result, console: Console) -> None:
-    """Prints what was measured."""
+def report(result: Result, console: Console, *, verbose: bool = False) -> None:
+    """Prints what was measured: one table and one sentence; if `verbose`, all that is known."""
     evaluation, metrics = result.evaluation, result.metrics
-    console.print(methods_table(evaluation, metrics))
-    if "full_trajectory" in evaluation.improvements:
-        console.print(methods_table(evaluation, metrics, "full_trajectory"))
-    sentences = []
+    console.print(methods_table(result, with_improvement=True))
+    if verbose and "full_trajectory" in evaluation.improvements:
+        console.print(methods_table(result, "full_trajectory"))
     compared = _comparisons(evaluation)
-    if evaluation.purpose is Purpose.ADAPTATION and compared:
+    adapts = evaluation.purpose is Purpose.ADAPTATION and bool(compared)
+    if verbose and adapts:
         console.print(_improvements_table(compared))
-        sentences += _doubts(compared)
-    if evaluation.purpose is Purpose.POLICY:
-        sentences.append(
-            "With constant parameters the model follows no leader: compare the policy's RMSE"
-            " with other jobs'."
-        )
-    else:  # the one number by which the job is known elsewhere: in MLflow, a report, Python
-        _, words = headline(metrics)
-        sentences += [f"In short: {words}."] if words else []
+    sentences = [_in_short(result)]
+    if adapts:
+        sentences += _undefined(compared)
     _say(sentences, console)
     for table in installed():
-        if table.name in result.tables:
+        if table.name in result.tables and (verbose or table.part.always_printed):
             for printed in _printed(table, evaluation, metrics):
                 console.print(printed)
-    sentences = _safety(evaluation, metrics)
+    if verbose:
+        _say(_remarks(result), console)
+
+
+def _in_short(result: Result) -> str:
+    """Returns the one sentence by which the job is known: in MLflow, a report and Python too."""
+    if result.purpose is Purpose.POLICY:
+        return (
+            "With constant parameters the model follows no leader: compare the policy's RMSE with"
+            " other jobs'."
+        )
+    _, words = headline(result.metrics)
+    return f"In short: {words}." if words else ""
+
+
+def _remarks(result: Result) -> list[str]:
+    """Returns what else is to be known: safety, parameters, where the policy was not at home."""
+    evaluation = result.evaluation
+    sentences = _safety(evaluation, result.metrics)
     for scope, words in evaluation.outside.items():
         sentences.append(
             f"Policy, {scope_label(scope)}: {words}; there it fades towards its base parameters."
@@ -65,7 +77,7 @@ def report(result: Result, console: Console) -> None:
             f"Not measured: {metric.name} of the distribution {metric.distribution}"
             f" ({metric.reason})."
         )
-    _say(sentences, console)
+    return sentences
 
 
 def _printed(
@@ -90,27 +102,33 @@ def report_places(
 
 def _say(sentences: Iterable[str], console: Console, *, markup: bool = True) -> None:
     for sentence in sentences:
-        console.print(sentence, soft_wrap=True, highlight=False, markup=markup)
+        if sentence:
+            console.print(sentence, soft_wrap=True, highlight=False, markup=markup)
 
 
-def methods_table(
-    evaluation: Evaluation, metrics: Mapping[str, float], scope: str = "test"
-) -> Table:
-    """Returns the metrics of one scope that are headlines: a row per method that has any."""
-    count = len(evaluation.trajectories)
-    plural = "" if count == 1 else "s"
-    fits = evaluation.tables.get("fits")
-    is_whole = scope == "test" and fits is not None and "test_rmse_speed" not in fits
-    part = "all of what was calibrated on," if is_whole else scope_label(scope)
-    title = f"{count} pair{plural}, {part} in closed loop"
-    table = Table(title=title, title_justify="left")
+def methods_table(result: Result, scope: str = "test", *, with_improvement: bool = False) -> Table:
+    """Returns the metrics of one scope that are headlines: a row per method that has any.
+
+    With `with_improvement` a column says by how much the policy is better than each other method.
+    """
+    evaluation, metrics = result.evaluation, result.metrics
+    table = Table(title=_title(evaluation, scope), title_justify="left")
     table.add_column("method", no_wrap=True)
-    shown = [one for one in evaluation.measured if one.headline and scope in one.scopes]
+    shown = []
+    for metric in evaluation.measured:
+        if metric.headline and scope in metric.scopes:
+            shown.append(metric)
     fitted = _fitted(evaluation) if scope == "test" else pd.DataFrame()
     for metric in shown:
-        table.add_column(escape(metric.title), justify="right")
+        unit = f"\n[{metric.unit}]" if metric.unit else ""
+        # A word a line: the table fits 80 columns, and no heading is cut.
+        heading = metric.heading.replace(" ", "\n")
+        table.add_column(escape(f"{heading}{unit}"), justify="right")
         if metric.name in fitted:
             table.add_column("where\nfitted", justify="right")
+    baselines = result.baselines(scope) if with_improvement else ()
+    if baselines:
+        table.add_column("policy better by %\n(95 % interval)", justify="right", no_wrap=True)
     for method in evaluation.methods:
         values = [metrics.get(key_of(metric.name, method, scope)) for metric in shown]
         if all(value is None for value in values):
@@ -120,8 +138,31 @@ def methods_table(
             cells.append(_cell(metric, value))
             if metric.name in fitted:
                 cells.append(_cell(metric, fitted[metric.name].get(method)))
+        if method in baselines:
+            cells.append(_improvement_cell(evaluation.improvements[scope][method]))
         table.add_row(short_label(method), *cells)
     return table
+
+
+def _title(evaluation: Evaluation, scope: str) -> str:
+    """Returns what a table of methods is of."""
+    fits = evaluation.tables.get("fits")
+    part = scope_label(scope)
+    if scope == "test" and fits is not None and "test_rmse_speed" not in fits:
+        part = "all of what was calibrated on,"
+    pairs = plural(len(evaluation.trajectories), "pair")
+    drivers = plural(evaluation.about["driver"].nunique(), "driver")
+    return f"{pairs} of {drivers}, {part} in closed loop"
+
+
+def _improvement_cell(improvement: Improvement) -> str:
+    """Returns an improvement with its interval, in percent."""
+    if not improvement.pairs:
+        return "not defined"
+    interval = "one driver"
+    if math.isfinite(improvement.ci95_low):
+        interval = f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"
+    return f"{100 * improvement.geometric:+.1f} ({interval})"
 
 
 def _fitted(evaluation: Evaluation) -> pd.DataFrame:
@@ -149,19 +190,18 @@ def _cell(metric: MetricInfo, value: float | None) -> str:
     return f"{value:.3f}"
 
 
-def _doubts(compared: Mapping[str, Improvement]) -> list[str]:
-    """Returns what limits the comparisons of the policy with baselines."""
+def _undefined(compared: Mapping[str, Improvement]) -> list[str]:
+    """Returns how many pairs have no improvement over each baseline, where there are such."""
     sentences = []
-    for over, one in compared.items():
-        if one.undefined:
+    for over, improvement in compared.items():
+        if improvement.undefined:
             baseline = over.partition(",")[0]
+            pairs = improvement.pairs + improvement.undefined
             sentences.append(
-                f"Over {' '.join(over.split())}: {one.undefined} of {one.pairs + one.undefined}"
-                f" pairs have no improvement: a simulation diverged, or {baseline} has no error at"
-                " all."
+                f"Over {' '.join(over.split())}: {improvement.undefined} of {pairs} pairs have no"
+                f" improvement: a simulation diverged, or {baseline} has no error at all."
             )
-    warning = few_drivers(max(one.drivers for one in compared.values()))
-    return [*sentences, warning] if warning else sentences
+    return sentences
 
 
 def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
@@ -182,29 +222,30 @@ def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
 
 
 def _improvements_table(compared: Mapping[str, Improvement]) -> Table:
-    """Returns a row per baseline: mean, interval, median, and for how many pairs it is better.
+    """Returns a row per baseline: improvement, interval, that of the means, and who is better off.
 
     It fits 80 columns. The other statistics are in `metrics.json` and in the report.
     """
     title = "Improvement of the policy over other methods, RMSE of speed, %"
     table = Table(title=title, title_justify="left")
     table.add_column("over")
-    for column in ("mean", "95 % interval", "median", "better for", "p"):
+    for column in ("geo-\nmetric", "95 % interval", "mean\nerrors", "better for", "p"):
         table.add_column(column, justify="right")
-    for over, one in compared.items():
-        if one.pairs == 0:
+    for over, improvement in compared.items():
+        if improvement.pairs == 0:
             table.add_row(over, "not defined")
             continue
         interval = "one driver"
-        if math.isfinite(one.ci95_low):
-            interval = f"{100 * one.ci95_low:+.1f} to {100 * one.ci95_high:+.1f}"
+        if math.isfinite(improvement.ci95_low):
+            interval = f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"
+        p_value = f"{improvement.p_value:.2g}" if math.isfinite(improvement.p_value) else ""
         table.add_row(
             over,
-            f"{100 * one.mean:+.1f}",
+            f"{100 * improvement.geometric:+.1f}",
             interval,
-            f"{100 * one.median:+.1f}",
-            f"{one.win_rate * one.pairs:.0f} of {one.pairs}",
-            f"{one.p_value:.2g}" if math.isfinite(one.p_value) else "",
+            f"{100 * improvement.ratio_of_means:+.1f}",
+            f"{improvement.win_rate * improvement.pairs:.0f} of {improvement.pairs}",
+            p_value,
         )
     return table
 

@@ -8,6 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
+from cfx.app.job.surroundings import with_signals_of_inputs
 from cfx.core import registry
 from cfx.core.processes import raise_if_signalled
 from cfx.data.base import load_pairs
@@ -32,6 +33,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     log.info("%s: starting", config.in_words())
     # An engine that is not installed is named at once too; it connects to nothing yet.
     registry.create("engine", config.engine)
+    config = with_signals_of_inputs(config)
     pairs = load_pairs(cast("Dataset", registry.create("dataset", config.data)))
 
     # These take seconds to import: a wrong path or column has been answered by now.
@@ -63,7 +65,9 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
         )
         result = steps.find(steps.compose(config, parts, pairs, style), parts, config)
         # Figures take seconds: the numbers are there before them.
-        result = result.write(folder, config, tell=partial(report, console=console))
+        result = result.write(
+            folder, config, tell=partial(report, console=console, verbose=config.output.verbose)
+        )
         # After the folder, so that no failure of MLflow loses it.
         tracker.log_job(result, described(result))
         if upload is not None:

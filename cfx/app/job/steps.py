@@ -13,6 +13,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from cfx.app.job.surroundings import require_signals, with_signals_of_inputs
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.identifiability import slices, training_errors
@@ -30,7 +31,7 @@ from cfx.core.storage import is_url
 from cfx.core.threads import limit_cores, set_threads
 from cfx.data.base import Dataset
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.signals import COARSE_S
+from cfx.data.resampling import COARSE_S
 from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.errors import ConfigError, PluginError
 from cfx.evaluation.demo import Demo
@@ -241,7 +242,7 @@ def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
     if config.threads is not None:
         set_threads(config.threads)
     protocol = make_protocol(config)
-    config = complete(config, protocol)
+    config = with_signals_of_inputs(complete(config, protocol))
     parts = Parts.of(config, protocol)
     if config.calibration.posterior != "none":
         # One that is not there is named at once.
@@ -288,6 +289,7 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
     bound = parts.simulator.settings.memory_mb * 2**20
     require_memory(bound, f"simulator.memory_mb={parts.simulator.settings.memory_mb}")
     device = choose_device(config.device)
+    require_signals(parts.policy, pairs)
     batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
     cache_folder: Path | str | None = None
     workspace = None
@@ -370,7 +372,6 @@ def find(context: ProtocolContext, parts: Parts, config: JobConfig) -> Result:
         notes=delivered.notes,
         recorded=context.pairs,
         style=context.style,
-        seed=context.seed,
     )
     metrics = {**evaluation.metrics(), **delivered.calibration}
     if delivered.labels is not None:
@@ -391,7 +392,7 @@ def job_tables(
     tables = {"curves": learning_curves(delivered.curves)}
     if delivered.labels is not None:
         tables["labels"] = delivered.labels.to_frame(context.pairs, evaluation.names)
-    sites = site_table(context.pairs, evaluation, seed=context.seed)
+    sites = site_table(context.pairs, evaluation)
     if sites is not None:
         tables["sites"] = sites
     return tables

@@ -114,13 +114,13 @@ class Sweep:
 
     def _finish(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
         """Writes and prints the summary, and says how to go on; returns the exit code."""
-        from cfx.evaluation.statistics import against_the_best, verdict  # imports NumPy
+        from cfx.evaluation.statistics import ranking_of, verdict  # imports NumPy
 
         lines = self._close_runs()
         table = summary.rows(statuses)
         summary.write_summary(self.folder / summary.SUMMARY, table)
         print_table(summary.summary_table(table, summary.metric_columns(list(statuses))))
-        said = verdict(against_the_best(summary.errors_of(statuses)))
+        said = verdict(ranking_of(summary.errors_of(statuses)))
         if said:
             print(said)
         code = self._count(statuses, code)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import math
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -13,7 +12,7 @@ from cfx.app.sweep.folder import JobStatus, metrics_of
 from cfx.core.console import blank_table
 from cfx.core.files import atomic_write
 from cfx.errors import DataError
-from cfx.evaluation.headline import main_comparison, ratio_of_means
+from cfx.evaluation.headline import main_comparison, summaries_disagree
 from cfx.figures.wording import short_label
 
 if TYPE_CHECKING:
@@ -25,8 +24,7 @@ if TYPE_CHECKING:
 SUMMARY = "summary.csv"
 """Says in a sweep's folder what came of it."""
 
-_STATISTICS = ("mean", "ci95_low", "ci95_high")
-_OF_MEANS = "of_means"
+_STATISTICS = ("geometric", "ci95_low", "ci95_high", "ratio_of_means", "drivers")
 _COMPARED = ["pair_id", "driver", "frames", "method", "rmse_speed"]
 _METHODS = ("default", "fixed", "population", "policy")
 _SHOWN = ("default", "population", "fixed", "policy")
@@ -184,7 +182,7 @@ def _improvement(found: Mapping[str, float]) -> dict[str, Any]:
     """Returns the improvement over the baseline that counts, None where it was not measured."""
     compared = main_comparison(found)
     row: dict[str, Any] = {_OVER: ""}
-    row |= dict.fromkeys(f"improvement_{name}" for name in (*_STATISTICS, _OF_MEANS))
+    row |= dict.fromkeys(f"improvement_{name}" for name in _STATISTICS)
     if compared is None:
         return row
     row[_OVER] = compared.baseline
@@ -192,23 +190,22 @@ def _improvement(found: Mapping[str, float]) -> dict[str, Any]:
         row[_OVER] += ", full"
     for name in _STATISTICS:
         row[f"improvement_{name}"] = found.get(f"{compared.key}/{name}")
-    ratio = ratio_of_means(found, compared)
-    row[f"improvement_{_OF_MEANS}"] = ratio if math.isfinite(ratio) else None
     return row
 
 
 def _improvement_said(row: Mapping[str, Any], *, named: bool) -> str:
     """Returns the improvement in words; `named`: with its baseline."""
-    mean = row["improvement_mean"]
-    if mean is None:
+    geometric = row["improvement_geometric"]
+    if geometric is None:
         return ""
-    said = f"{mean:+.1%}"
+    said = f"{geometric:+.1%}"
     low, high = row["improvement_ci95_low"], row["improvement_ci95_high"]
     if low is not None and high is not None:
         said += f" ({low:+.1%} to {high:+.1%})"
-    ratio = row[f"improvement_{_OF_MEANS}"]
-    if ratio is not None and mean * ratio < 0:
-        said += f"\nof the mean RMSE {ratio:+.1%}"
+    ratio = row["improvement_ratio_of_means"]
+    note = "" if ratio is None else summaries_disagree(geometric, ratio)
+    if note:
+        said += f"\n{note}"
     if named:
         said += f" over {_in_words(row[_OVER])}"
     return said

@@ -142,7 +142,7 @@ class Trained:
     def policy_after(self, evaluation: Evaluation) -> Agent:
         """Returns the policy, which knows of its test what error to expect of it."""
         policy = self.test.policy
-        if self.fold is None or not policy.policy.trainable:
+        if self.fold is None or not policy.core.policy.trainable:
             return policy
         expected, fold = ExpectedError(), self.fold.cpu().numpy()
         if "past" in evaluation.tables:

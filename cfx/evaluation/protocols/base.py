@@ -198,8 +198,7 @@ class ProtocolContext:
             tested,
             scopes,
             self.space,
-            seed=self.seed,
-            policy_space=policy.model_space,
+            policy_space=policy.core.head.model_space,
             metrics=self.metrics,
         )
         return replace(evaluation, platoon=platoon, outside=outside_of_scopes(policy, scopes))

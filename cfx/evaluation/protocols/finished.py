@@ -23,6 +23,7 @@ from cfx.evaluation.protocols.held_out import HeldOut
 from cfx.learners.base import CURVE_COLUMNS
 from cfx.policies import checkpoint
 from cfx.policies.agent import Agent
+from cfx.policies.known_drivers import base_of
 from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)
@@ -85,7 +86,7 @@ class FinishedPolicy:
             start = policy.base.to(fixed.dtype)
             if policy.context_rule.driver_specific:
                 # Of the model alone: constant parameters of a driver are a baseline, `shrunk`.
-                base = policy.base_of(fixed)[:, : fixed.shape[1]]
+                base = base_of(policy, fixed)[:, : fixed.shape[1]]
         population = policy.population
         test = HeldOut(
             context=context,

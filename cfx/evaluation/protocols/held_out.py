@@ -28,6 +28,7 @@ from cfx.evaluation.protocols.past import (
 from cfx.evaluation.result import Evaluation, Platoon
 from cfx.policies.agent import Agent
 from cfx.policies.constant import DefaultPolicy, FixedPolicy
+from cfx.policies.known_drivers import driver_features_of, unlikeness
 
 
 @dataclass(frozen=True)
@@ -86,7 +87,7 @@ class HeldOut:
             tables["history"] = self.history(histories, loops["fixed"])
         # A policy from elsewhere may know no drivers like these; their pasts say so.
         is_from_elsewhere = fold is None and self.policy.context_rule.history_s is None
-        if self.combines or (is_from_elsewhere and self.policy.policy.trainable):
+        if self.combines or (is_from_elsewhere and self.policy.core.policy.trainable):
             tables["past"] = self._past_table(loops, fold)
         scopes = {"test": loops, "full_trajectory": self._full_trajectory(methods)}
         tested = ComparedPairs(self.pairs, self.batch, self.first, context.style, fold)
@@ -144,9 +145,9 @@ class HeldOut:
         )
         for name, loop in loops.items():
             table[f"rmse_speed_{name}"], _ = closed_loop_errors(self.batch, self.first, loop)
-        features = self.policy.driver_features_of(self.batch, self.first)
+        features = driver_features_of(self.policy, self.batch, self.first)
         if features is not None:
-            away = self.policy.unlikeness(features, self.network).abs()
+            away = unlikeness(self.policy, features, self.network).abs()
             names = np.array(self.policy.core.driver_features)
             table["unlike"] = away.max(1).values.cpu().numpy()
             table["unlike_in"] = np.where(

@@ -35,6 +35,7 @@ from cfx.evaluation.result import Array
 from cfx.policies.agent import Agent
 from cfx.policies.constant import FixedPolicy
 from cfx.policies.context import ExpectedError, conformal_bound
+from cfx.policies.known_drivers import base_of
 
 EARLIER = 0.6
 """Share of the past on which own parameters are calibrated, to be tested on the rest."""
@@ -116,9 +117,10 @@ def past_errors(
         base, batch = followers.base[rows], batch[rows].until(first)
         early = context.calibrator.fixed(pairs, batch, cut.cpu()).to(base)
         if policy.base is not None and policy.context_rule.driver_specific:
-            base = policy.base_of(early)[:, : early.shape[1]]
+            base = base_of(policy, early)[:, : early.shape[1]]
         each = torch.arange(len(rows), device=rows.device)
-        residual = policy.head.driven_model(context.simulator.model) is not context.simulator.model
+        model = context.simulator.model
+        residual = policy.core.head.driven_model(model) is not model
 
         def errors(agent: Agent, followers: Followers) -> Tensor:
             return _speed_errors(context.simulated(agent, followers, cut), batch, cut)

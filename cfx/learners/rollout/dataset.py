@@ -19,14 +19,17 @@ from torch import Tensor
 
 from cfx.core import memory
 from cfx.core.parameters import squashed
-from cfx.data.pairs import SIGNALS, PairBatch
+from cfx.data.pairs import PairBatch
+from cfx.data.signals import RECORDED
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.policies.base import Policy
 from cfx.policies.core import Grid
 from cfx.policies.driver_features import measure
-from cfx.policies.features import Scaler, measured_history, tokens
+from cfx.policies.features import Scaler, tokens
 from cfx.policies.heads.base import ParameterHead
+from cfx.policies.history import measured_history
+from cfx.policies.inputs import policy_inputs
 
 _FEW_DRIVERS = 5
 """A network with fewer drivers keeps the end of each trajectory for validation, not drivers."""
@@ -496,22 +499,24 @@ def _validation_drivers(
 
 def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
     """Returns pairs `(U,)` in single precision, which resolves positions on them to 0.1 mm."""
-    changed = {}
-    for name in SIGNALS:
-        signal = getattr(batch, name)
+    together = len(RECORDED) + len(batch.surroundings)
+
+    def rows_of(signal: Tensor) -> Tensor:
         shape = (len(pair), signal.shape[1])
-        values = torch.as_tensor(memory.empty(shape, np.float32, together=len(SIGNALS)))
+        values = torch.as_tensor(memory.empty(shape, np.float32, together=together))
         values = values.to(signal.device)
         for part in _parts(len(pair)):
             values[part] = signal[pair[part]].float()
             memory.release()
-        changed[name] = values
+        return values
+
     return PairBatch(
-        **changed,
+        **{name: rows_of(getattr(batch, name)) for name in RECORDED},
         leader_length=batch.leader_length[pair].float(),
         lengths=batch.lengths[pair],
         mask=batch.mask[pair],
         dt=batch.dt,
+        surroundings={signal: rows_of(values) for signal, values in batch.surroundings.items()},
     )
 
 
@@ -528,11 +533,12 @@ def _measured_tokens(
     device = batch.lengths.device
     end = int(last.max()) + 1
     windows = torch.arange(0, end, training_data.windows.stride, device=device)
+    inputs = policy_inputs(policy.inputs)
     found = torch.empty(0)
     for part in _parts(len(batch)):
         pairs = torch.arange(part.start, part.stop, device=device)[:, None]
         history = measured_history(batch, pairs, windows, training_data.windows.length)
-        own = tokens(history, policy.inputs, policy.summary)
+        own = tokens(history, inputs, policy.summary)
         if part.start == 0:
             room = memory.empty((len(batch), *own.shape[1:]), np.float32)
             found = torch.as_tensor(room).to(device)

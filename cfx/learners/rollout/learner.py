@@ -227,13 +227,13 @@ def check_start(
     """
     model, windows = training_data.simulator.model, training_data.windows
     unlike: list[tuple[str, object]] = []
-    if agent.policy.identity() != policy.identity():
+    if agent.core.policy.identity() != policy.identity():
         unlike.append(("policy", agent.policy_node))
     is_other = not isinstance(model, registry.get("model", str(agent.model_node.get("name"))))
-    if is_other or agent.model_space.names != model.space.names:
+    if is_other or agent.core.head.model_space.names != model.space.names:
         unlike.append(("model", agent.model_node))
-    if agent.head.name != head.name:
-        unlike.append(("learner.head", agent.head.name))
+    if agent.core.head.name != head.name:
+        unlike.append(("learner.head", agent.core.head.name))
     if agent.windows != windows:
         unlike.append(("windows", agent.windows.model_dump()))
     if abs(agent.dt - training_data.simulator.dt) > 1e-6:
@@ -268,11 +268,11 @@ def begun(
             f" learner.ensemble_size={size}"
         )
     weights: dict[str, Tensor] = {}
-    for name, value in agent.network.state_dict().items():
+    for name, value in agent.core.network.state_dict().items():
         repeated = value.repeat(len(dataset.pair) // size, *[1] * (value.dim() - 1))
         weights[name.removeprefix("members.") if size > 1 else name] = repeated
     network.load_state_dict(weights)
-    mean, scale = agent.scaler.mean, agent.scaler.scale
+    mean, scale = agent.core.scaler.mean, agent.core.scaler.scale
     networks = len(dataset.pair)
     scaler = Scaler(mean.expand(networks, -1).clone(), scale.expand(networks, -1).clone())
     return network, replace(dataset, scaler=scaler.to(dataset.pair.device))

@@ -15,7 +15,7 @@ from torch import Tensor
 from cfx.learners.base import Augment
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.settings import RolloutSettings
-from cfx.policies.features import History
+from cfx.policies.history import History
 
 _VALIDATION_STARTS = (0.2, 0.4, 0.6, 0.8)
 """Shares of a validation trajectory at which the policy takes over."""
@@ -170,16 +170,18 @@ def augmentation(
     """
 
     def augment(history: History, pairs: Tensor) -> History:
-        like = history.gap
-        normal = torch.randn(like.shape, generator=generator).to(like)
-        draws = torch.rand((2, *like.shape), generator=generator).to(like)
+        gap = history["gap"]
+        normal = torch.randn(gap.shape, generator=generator).to(gap)
+        draws = torch.rand((2, *gap.shape), generator=generator).to(gap)
         scale = torch.exp(settings.scaling * normal)
         shift = torch.where(draws[0] < SHIFTED, settings.speed_shift * draws[1], 0.0)
-        scaled = History(*(signal * scale for signal in history))
-        return scaled._replace(
-            leader_speed=scaled.leader_speed + shift,
-            follower_speed=scaled.follower_speed + shift,
-            gap=scaled.gap + shift * time_gap[pairs][:, None].to(like),
-        )
+        wider = shift * time_gap[pairs][:, None].to(gap)
+        return {
+            "leader_speed": history["leader_speed"] * scale + shift,
+            "leader_acceleration": history["leader_acceleration"] * scale,
+            "follower_speed": history["follower_speed"] * scale + shift,
+            "follower_acceleration": history["follower_acceleration"] * scale,
+            "gap": gap * scale + wider,
+        }
 
     return augment

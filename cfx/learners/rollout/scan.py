@@ -122,7 +122,10 @@ class Scan:
         self.step, self.network, self.temperature = step, network, temperature
         length = step.length
         motion = dict.fromkeys(_MOTION, length)
-        leader = {f"leader_{name}": length + step.stride for name in _MOTION}
+        self.around_names = [f"leader_{name}" for name in _MOTION]
+        for signal in core.further_signals:
+            self.around_names.append(f"around_{signal.name}")
+        leader = dict.fromkeys(self.around_names, length + step.stride)
         around = {**motion, **leader, "leader_length": 1}
         width = core.scaler.mean.shape[-1]
         known = width - token_width(core.inputs, core.summary, length)
@@ -188,7 +191,7 @@ class Scan:
 
     def _read(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
         """Returns normalised features."""
-        features = self.step.features(*_around(given), given["conditioning"])
+        features = self.step.features(*self._around(given), given["conditioning"])
         return [(features - given["mean"]) / given["scale"]]
 
     def _moved(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
@@ -198,11 +201,20 @@ class Scan:
             step = copy.copy(step)
             step.model = step.model.at_temperature(given["temperature"][..., 0])
         answer = (given["logits"] + given["bias"]).sigmoid()
-        after, speed, gap = step.steer(answer, *_around(given), given["base"])
+        after, speed, gap = step.steer(answer, *self._around(given), given["base"])
         moved = [after.position, after.speed, after.acceleration]
         if after.memory.shape[-1] > 0:
             moved.append(after.memory)
         return [*moved, speed, gap]
+
+    def _around(self, given: Mapping[str, Tensor]) -> tuple[LoopState, LeaderWindow, Tensor]:
+        """Returns where trajectories stand, and the leaders around a window with their lengths."""
+        nothing = given["position"][..., :0]
+        motion = (given["position"], given["speed"], given["acceleration"])
+        now = LoopState(*motion, given.get("memory", nothing), nothing, nothing)
+        position, speed, acceleration, *more = [given[name] for name in self.around_names]
+        leader = LeaderWindow(position, speed, acceleration, tuple(more))
+        return now, leader, given["leader_length"][..., 0]
 
     def _cell(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
         """Returns what a layer carries after a window."""
@@ -212,22 +224,13 @@ class Scan:
         return [torch.where(given["present"] > 0, after, given["carried"])]
 
 
-def _around(given: Mapping[str, Tensor]) -> tuple[LoopState, LeaderWindow, Tensor]:
-    """Returns where trajectories stand, and the leaders around a window with their lengths."""
-    nothing = given["position"][..., :0]
-    motion = (given["position"], given["speed"], given["acceleration"])
-    now = LoopState(*motion, given.get("memory", nothing), nothing, nothing)
-    leader = LeaderWindow(*(given[f"leader_{name}"] for name in _MOTION))
-    return now, leader, given["leader_length"][..., 0]
-
-
 class _Known(NamedTuple):
     """What some windows read that no network changes.
 
     Attributes:
         features: of observed windows, normalised, `(B, N, D, F)`.
         present: 1 where a trajectory has that window, else 0, `(B, N, D)`.
-        leader: `(3, H, N, D, L + S)`.
+        leader: `(3 + E, H, N, D, L + S)`, as `RolloutInputs.leader`.
         leader_length: `(N, D)`.
         conditioning: `(N, D, c)`.
         base: `(N, D, n)`.
@@ -340,8 +343,8 @@ class _Loop:
         if scan.temperature is not None:
             shared["temperature"] = scan.temperature.expand(everywhere[:-1]).unsqueeze(-1)
         around = {name: Operand(value) for name, value in shared.items()}
-        for name, signal in zip(_MOTION, known.leader, strict=True):
-            around[f"leader_{name}"] = Operand.over(signal.unsqueeze(2), -self.observed)
+        for name, signal in zip(scan.around_names, known.leader, strict=True):
+            around[name] = Operand.over(signal.unsqueeze(2), -self.observed)
         around["logits"] = self.in_driven(self.logits)
         return around | self.columns(self.motion, -self.observed)
 

@@ -72,15 +72,23 @@ def _add_content(digest: hashlib._Hash, record: Any) -> None:
     of a tensor count beside its numbers: `(2, 3)` and `(3, 2)` zeros have the same bytes.
     """
     for field in fields(record):
-        value = getattr(record, field.name)
         digest.update(f"\n{field.name}=".encode())
-        if is_dataclass(value):
-            _add_content(digest, value)
-        elif isinstance(value, Tensor):
-            digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
-            digest.update(value.detach().cpu().contiguous().numpy().tobytes())
-        else:
-            digest.update(repr(value).encode())
+        _add_value(digest, getattr(record, field.name))
+
+
+def _add_value(digest: hashlib._Hash, value: Any) -> None:
+    """Adds a field's value to a digest."""
+    if is_dataclass(value):
+        _add_content(digest, value)
+    elif isinstance(value, Tensor):
+        digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
+        digest.update(value.detach().cpu().contiguous().numpy().tobytes())
+    elif isinstance(value, Mapping):
+        for key, part in value.items():
+            digest.update(f"{key!r}:".encode())
+            _add_value(digest, part)
+    else:
+        digest.update(repr(value).encode())
 
 
 _TRAJECTORIES = 3_000

@@ -14,8 +14,8 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
+from cfx.data.accelerations import averaged
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.data.signals import averaged
 from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split

@@ -25,11 +25,12 @@ from cfx.calibration import losses
 from cfx.core import parameters
 from cfx.core.component import folder_hash
 from cfx.data.pairs import PairBatch
+from cfx.data.signals import Signal
 from cfx.learners.rollout.dataset import RolloutBatch
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.policies import features
+from cfx.policies import features, inputs
 from cfx.policies.core import AgentCore
-from cfx.policies.features import History
+from cfx.policies.history import History
 from cfx.simulation.kernel.compiler import torch_compiled
 from cfx.simulation.kernel.run import component_code
 from cfx.simulation.step import advance_vehicle
@@ -63,11 +64,14 @@ class LeaderWindow(NamedTuple):
         position: front bumper, `(N, D, L + S)`, m.
         speed: `(N, D, L + S)`, m/s.
         acceleration: `(N, D, L + S)`, m/s2.
+        surroundings: the policy's further signals, as `PairBatch.surroundings` stores them, `(N, D,
+            L + S)` each.
     """
 
     position: Tensor
     speed: Tensor
     acceleration: Tensor
+    surroundings: tuple[Tensor, ...] = ()
 
 
 class WindowStep:
@@ -102,13 +106,16 @@ class WindowStep:
         """Returns what the window depends on besides tensors; None if only this process knows."""
         core = self.core
         code = []
-        for component in (type(self.model), type(core.head), type(core.policy)):
-            code.append(component_code(component))
+        parts = (self.model, core.head, core.policy, *core.inputs)
+        for part in parts:
+            code.append(component_code(type(part)))
         if None in code:
             return None
         settings = [self.model.equations_key(), repr(self.space), self.length, self.stride, self.dt]
-        read = [core.inputs, core.summary, core.scaler.mean.shape[-1]]
-        rooms = [folder_hash(module.__file__) for module in (features, parameters, losses)]
+        read = [core.policy.inputs, core.summary, core.scaler.mean.shape[-1]]
+        rooms = []
+        for module in (features, inputs, parameters, losses):
+            rooms.append(folder_hash(str(module.__file__)))
         return [code, settings, read, rooms, folder_hash(__file__)]
 
     def observe(
@@ -220,13 +227,16 @@ class WindowStep:
     def _history(self, now: LoopState, leader: LeaderWindow, leader_length: Tensor) -> History:
         """Returns what the policy sees: the last L frames."""
         past = slice(None, self.length)
-        return History(
-            leader.speed[..., past],
-            leader.acceleration[..., past],
-            now.speed,
-            now.acceleration,
-            leader.position[..., past] - leader_length[..., None] - now.position,
-        )
+        history = {
+            "leader_speed": leader.speed[..., past],
+            "leader_acceleration": leader.acceleration[..., past],
+            "follower_speed": now.speed,
+            "follower_acceleration": now.acceleration,
+            "gap": leader.position[..., past] - leader_length[..., None] - now.position,
+        }
+        for signal, stored in zip(self.core.further_signals, leader.surroundings, strict=True):
+            history[signal.name] = signal.seen_from(now.position, stored[..., past])
+        return history
 
     def _shift(self, before: Tensor, after: Tensor) -> Tensor:
         """Returns the last L frames after a window."""
@@ -329,8 +339,9 @@ class RolloutInputs:
     Positions are relative to the follower's at the start of its trajectory.
 
     Attributes:
-        leader: position, speed, acceleration, window by window, `(3, H, N, D, L + S)`, SI units;
-            frame by frame in memory, those of two windows once.
+        leader: position, speed, acceleration, then the policy's E further signals, window by
+            window, `(3 + E, H, N, D, L + S)`, SI units; frame by frame in memory, those of two
+            windows once.
         leader_length: `(N, D)`, m.
         follower: position, speed, acceleration of the last L frames before the policy takes over,
             `(3, N, D, L)`, SI units.
@@ -375,6 +386,12 @@ class RolloutInputs:
         speed = _at(pairs.follower_speed, each, simulated)
         gap = _at(pairs.gap, each, simulated)
         leader_length = pairs.leader_length[pair]
+        surroundings = []
+        for signal in step.core.further_signals:
+            stored = _at(pairs.surroundings[signal], pair, around)
+            if signal.quantity == "gap":
+                stored = stored - origin[..., 0]
+            surroundings.append(_augmented(signal, stored, frames, batch, step.dt))
         if batch.scale is not None:
             scale = batch.scale[..., None]
             follower, speed, gap = follower * scale, speed * scale, gap * scale
@@ -393,6 +410,8 @@ class RolloutInputs:
         memory = step.model.initial_memory(follower[1, ..., -1])
         latent = memory.new_zeros((*pair.shape, step.core.head.latent_width))
         measured = Measured(speed, gap, counted)
+        if surroundings:
+            leader = torch.cat([leader, torch.stack(surroundings)])
         leader = leader.unfold(1, length + stride, stride)
         return cls(leader, leader_length, follower, memory, latent, measured)
 
@@ -417,14 +436,38 @@ class RolloutInputs:
 
     def leader_window(self, window: int) -> LeaderWindow:
         """Returns the leader around a window."""
-        position, speed, acceleration = self.leader[:, window].contiguous().unbind(0)
-        return LeaderWindow(position, speed, acceleration)
+        position, speed, acceleration, *more = self.leader[:, window].contiguous().unbind(0)
+        return LeaderWindow(position, speed, acceleration, tuple(more))
 
 
 def _moved(shift: Tensor, time: Tensor, ahead: Tensor) -> list[Tensor]:
     """Returns what a faster road adds to position, speed and acceleration at times, s."""
     position = shift * time + ahead
     return [position, shift.expand_as(position), torch.zeros_like(position)]
+
+
+def _augmented(
+    signal: Signal, stored: Tensor, frames: Tensor, batch: RolloutBatch, dt: float
+) -> Tensor:
+    """Returns a further signal `(frames, N, D)` on the scaled or faster road of trajectories.
+
+    Args:
+        signal: which.
+        stored: as recorded, of a gap the position of what is ahead.
+        frames: since the trajectories began, `(frames,)`.
+        batch: how each trajectory is changed.
+        dt: time step, s.
+    """
+    if batch.scale is not None and signal.is_scaled:
+        stored = stored * batch.scale
+    if batch.shift is None or batch.wider is None:
+        return stored
+    time = frames[:, None, None] * dt
+    if signal.quantity == "gap":
+        return stored + batch.shift * time + batch.wider
+    if signal.quantity == "speed":
+        return stored + batch.shift
+    return stored
 
 
 def _at(signal: Tensor, pair: Tensor, frames: Tensor) -> Tensor:

@@ -35,9 +35,12 @@ def trained_head(learner: str) -> Callable[[str], str]:
     """Returns the check of a learner's setting `head`: it is one that the learner trains."""
 
     def check(name: str) -> str:
-        known = [one for one in registry.names("head") if learner in head_class(one).learners]
-        if name not in known:
-            raise ValueError(f"should be one of {', '.join(known)}")
+        trained = []
+        for head in registry.names("head"):
+            if learner in head_class(head).learners:
+                trained.append(head)
+        if name not in trained:
+            raise ValueError(f"should be one of {', '.join(trained)}")
         return name
 
     return check

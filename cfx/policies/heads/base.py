@@ -14,7 +14,7 @@ from torch import Tensor
 
 from cfx.core.parameters import ParameterSpace
 from cfx.models.base import DrivingModel
-from cfx.policies.features import History
+from cfx.policies.history import History
 
 
 class ParameterHead(ABC):
@@ -46,6 +46,11 @@ class ParameterHead(ABC):
     @abstractmethod
     def for_model(cls, model: DrivingModel, device: torch.device | str | None = None) -> Self:
         """Returns the head for a driving model's parameters: it chooses the parameter space."""
+
+    @property
+    def is_stochastic(self) -> bool:
+        """Whether it draws random numbers."""
+        return self.noise_width > 0
 
     def to(self, device: torch.device | str) -> Self:
         """Returns the same head for tensors of a device."""

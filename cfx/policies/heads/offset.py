@@ -81,9 +81,9 @@ def shrunk(space: ParameterSpace, parameters: Tensor, shrinkage: float) -> Tenso
     if shrinkage == 0:
         return parameters
     default = space.defaults(dtype=parameters.dtype, device=parameters.device)
-    own = squashed(space.to_unit(parameters))
+    calibrated = squashed(space.to_unit(parameters))
     target = squashed(space.to_unit(default.expand_as(parameters)))
-    return space.from_unit(torch.sigmoid(torch.lerp(own, target, shrinkage)))
+    return space.from_unit(torch.sigmoid(torch.lerp(calibrated, target, shrinkage)))
 
 
 def blended(base: Tensor, unit: Tensor, weight: Tensor) -> Tensor:

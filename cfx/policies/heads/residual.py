@@ -19,9 +19,9 @@ from torch import Tensor
 from cfx.core.parameters import ParameterSpace
 from cfx.models.base import DrivingModel
 from cfx.models.composed import JERK, RESIDUAL, WithResidual, with_residual
-from cfx.policies.features import History
 from cfx.policies.heads.base import DirectHead, ParameterHead
 from cfx.policies.heads.offset import OffsetHead
+from cfx.policies.history import History
 
 
 class _Residual(ParameterHead):
@@ -36,7 +36,7 @@ class _Residual(ParameterHead):
 
     def measured(self, parameters: Tensor, history: History, dt: float) -> Tensor:
         """Fills in the jerk between the last two frames; of one frame nothing is measured."""
-        acceleration = history.follower_acceleration
+        acceleration = history["follower_acceleration"]
         if acceleration.shape[-1] < 2:
             return parameters
         jerk = (acceleration[..., -1] - acceleration[..., -2]) / dt

@@ -88,11 +88,13 @@ class StochasticHead(ResidualHead):
 
     def __init__(self, space: ParameterSpace, device: torch.device | str | None = None) -> None:
         super().__init__(space, device)
-        drawn = [name for name in space.names if _scale_name(name) in space.names]
+        drawn = []  # places of parameters that have a scale
+        for place, name in enumerate(space.names):
+            if _scale_name(name) in space.names:
+                drawn.append(place)
         self.latent_width = len(drawn)
         self.noise_width = 1 + self.latent_width
-        index = [space.names.index(name) for name in drawn]
-        self._drawn = torch.tensor(index, dtype=torch.int64, device=device)
+        self._drawn = torch.tensor(drawn, dtype=torch.int64, device=device)
         self._low, self._high = space.bounds(device=device)[:, self._drawn].unbind(0)
 
     @classmethod
@@ -157,12 +159,14 @@ class StochasticHead(ResidualHead):
 
 def _scale_of(parameter: Parameter, default: float) -> Parameter:
     """Returns the scale of a parameter; 0 where it is frozen."""
+    if parameter.frozen:
+        default = 0.0
     return Parameter(
         _scale_name(parameter.name),
         "1",
         0.0,
         2.0,
-        0.0 if parameter.frozen else default,
+        default,
         f"standard deviation of {parameter.name} in the squashed space",
         "on logits: 0.3 are some 7 % of the range in its middle",
         frozen=parameter.frozen,

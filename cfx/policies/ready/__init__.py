@@ -21,10 +21,10 @@ READY_FOLDER = Path(__file__).resolve().parent / "policies"
 
 def names() -> tuple[str, ...]:
     """Returns the names of all ready-made policies, sorted."""
-    found = []
+    cards = []
     for card in READY_FOLDER.glob("*/card.json"):
-        found.append(card.parent.name)
-    return tuple(sorted(found))
+        cards.append(card.parent.name)
+    return tuple(sorted(cards))
 
 
 def is_ready_made(text: object) -> bool:

@@ -185,7 +185,7 @@ _LABELLED = 8
 
 @canvas.styled
 def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
-    """Draws sorted bars of every pair's improvement with mean, 95 % interval, trimmed mean, median.
+    """Draws sorted bars of every pair's improvement with its summaries and the 95 % interval.
 
     A bar has the colour of the method that was closer to the driver. Bars that are cut off end in
     an arrow with the value. Pairs without a defined improvement are counted in the axis label.
@@ -270,12 +270,11 @@ def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | P
     ends = (summary.ci95_low, summary.ci95_high)
     if np.isfinite(ends).all():
         axes.axhspan(*ends, color="#000000", alpha=0.13, linewidth=0, zorder=0.5)
-        low_end, high_end = (wording.percent(end, 1) for end in ends)
-        text = f"95 % interval of the mean: {low_end} to {high_end}"
+        text = f"its 95 % interval: {wording.percent(ends[0], 1)} to {wording.percent(ends[1], 1)}"
         handles.append(Patch(color="#000000", alpha=0.13, label=text))
     lines: tuple[tuple[str, float, canvas.Dash, float], ...] = (
-        ("mean", summary.mean, "solid", 1.8),
-        ("trimmed mean", summary.trimmed_mean, (0, (5, 1.8)), 1.4),
+        ("improvement (geometric mean over drivers)", summary.geometric, "solid", 1.8),
+        ("of the mean errors", summary.ratio_of_means, (0, (5, 1.8)), 1.4),
         ("median", summary.median, (0, (1.2, 1.4)), 1.6),
     )
     for name, value, dash, width in lines:
@@ -324,6 +323,6 @@ def draw_improvement(result: Result, baseline: str, column: str) -> Figure:
         [rows["pair_id"].astype(str).tolist()],
         [rows[column].to_numpy(dtype=float)],
         baseline=baseline,
-        marks=(summary.mean, summary.ci95_low, summary.ci95_high),
+        marks=(summary.geometric, summary.ci95_low, summary.ci95_high),
     )
     return draw_improvements(bars, summary)

@@ -30,7 +30,9 @@ class ServedPolicy(PythonModel):
         model_input: pd.DataFrame,
         params: dict[str, Any] | None = None,
     ) -> pd.DataFrame:
-        return self._policy.predict_frame(model_input)
+        from cfx.policies.prediction import predict_frame
+
+        return predict_frame(self._policy, model_input)
 
 
 mlflow.models.set_model(ServedPolicy())

@@ -20,7 +20,7 @@ from urllib.parse import quote, urlencode
 import numpy as np
 import pandas as pd
 
-from cfx.data.pairs import SIGNALS, PairSet
+from cfx.data.pairs import PairSet
 from cfx.errors import CfxError, TrackingError
 from cfx.evaluation.headline import RESULT, fitted_errors, headline
 from cfx.evaluation.result import Purpose
@@ -394,13 +394,12 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
 
     from cfx.data.tidy import frame_of
     from cfx.policies import checkpoint
+    from cfx.policies.prediction import predict_frame
 
-    first = pairs[0]
-    length = min(len(first), _EXAMPLE_FRAMES)
-    cut = {name: getattr(first, name)[:length] for name in SIGNALS}
-    frame = frame_of(PairSet((replace(first, truth={}, truth_model="", **cut),), pairs.source))
+    first = replace(pairs[0].beginning(_EXAMPLE_FRAMES), truth={}, truth_model="")
+    frame = frame_of(PairSet((first,), pairs.source))
     try:
-        answer = checkpoint.load_agent(folder).predict_frame(frame)
+        answer = predict_frame(checkpoint.load_agent(folder), frame)
     except CfxError as error:
         log.info("The policy has no input example in MLflow: %s", error)
         return {}
@@ -424,7 +423,7 @@ def sweep_link(experiment_id: str, sweep: str) -> str:
         "searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'",
         # Sorted by date, MLflow's page would fold the jobs away under their parent, and draw no
         # charts.
-        "orderByKey": "metrics.`rmse_improvement/mean`",
+        "orderByKey": "metrics.`rmse_improvement/geometric`",
         "orderByAsc": "false",
         "compareRunsMode": "CHART",
         "workflowType": "machine_learning",

@@ -15,7 +15,8 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.gradient_search import GradientSearch
 from cfx.calibration.shards import Solver
-from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import RECORDED
 from cfx.errors import ConfigError
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.evaluation.forecasts import Origins
@@ -205,7 +206,7 @@ def test_recalibration_is_the_calibration_of_the_latest_history() -> None:
     )
     cut = []
     for pair in pairs:
-        signals = {name: getattr(pair, name)[until + 1 - kept : until + 1] for name in SIGNALS}
+        signals = {name: getattr(pair, name)[until + 1 - kept : until + 1] for name in RECORDED}
         cut.append(type(pair)(**{**vars(pair), **signals}))
     latest = PairSet(tuple(cut), "the latest history")
     calibrator = Calibrator(
@@ -267,7 +268,9 @@ def test_with_a_residual_a_forecast_starts_with_the_drivers_acceleration(residua
     model = IDM()
     agent = agent_of(UkfPolicy(), model, model.space.defaults()[None])
     head = head_class("direct_residual" if residual else "direct").for_model(model)
-    agent = replace(agent, core=AgentCore(agent.policy, agent.network, agent.scaler, head))
+    agent = replace(
+        agent, core=AgentCore(agent.core.policy, agent.core.network, agent.core.scaler, head)
+    )
     origins = Origins(torch.tensor([0, 1, 2]), torch.tensor([100, 120, 150]))
     paths = simulate_from_origins(
         MemoryStepper(model, 0.1), agent, Followers(batch, torch.zeros(3).long()), origins, 1
@@ -293,7 +296,7 @@ def test_an_estimator_is_saved_and_loaded(name: str, tmp_path: Path) -> None:
     head = head_class("direct_residual").for_model(Krauss())
     agent = replace(
         agent,
-        core=AgentCore(agent.policy, agent.network, agent.scaler, head),
+        core=AgentCore(agent.core.policy, agent.core.network, agent.core.scaler, head),
         policy_node={"name": name, **policy.settings.model_dump(), "residual": True},
     )
     checkpoint.save_agent(agent, tmp_path)

@@ -117,13 +117,13 @@ def test_a_job_trains_it_and_what_is_saved_drives_the_same(
         "figures=none",
     ]
     result = cfx.run(["policy=tcn", "policy.channels=8", "policy.levels=2", *quick])
-    assert isinstance(result.policy.network, TcnNetwork)
+    assert isinstance(result.policy.core.network, TcnNetwork)
     curves = pd.read_parquet(result.folder / "curves.parquet").groupby("epoch").train_loss.mean()
     assert curves.iloc[-1] < curves.iloc[0]
-    again = cfx.load(result.folder).policy.network
+    again = cfx.load(result.folder).policy.core.network
     tokens = noise(4, 1, 9, 10).float()
     mine, theirs = (
         network(tokens, network.initial_state(4, 1))[0]
-        for network in (result.policy.network, again)
+        for network in (result.policy.core.network, again)
     )
     assert torch.equal(mine, theirs)

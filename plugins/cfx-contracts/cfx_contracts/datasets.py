@@ -8,7 +8,8 @@ import numpy as np
 
 from cfx.core.contract import once
 from cfx.data.base import Dataset, DatasetSettings
-from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import RECORDED
 from cfx.errors import CfxError, DataError
 from cfx_contracts import contract_of
 
@@ -16,7 +17,7 @@ from cfx_contracts import contract_of
 def every_number_is_finite(dataset: Dataset) -> None:
     pairs = _loaded(dataset)
     for pair in pairs:
-        for name in SIGNALS:
+        for name in RECORDED:
             assert bool(np.isfinite(getattr(pair, name)).all()), (
                 f"{name} of pair {pair.pair_id}: missing data must split the pair,"
                 " for a simulation cannot step over them"

@@ -16,16 +16,17 @@ from torch import Tensor
 
 from cfx.calibration.calibrator import Labels
 from cfx.core.contract import expect_close, once
-from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import RECORDED
 from cfx.evaluation.closed_loop import Followers, simulate_closed_loop
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingPairs, TrainingResult
 from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
 from cfx.policies.core import AgentCore, Ensemble, features_read
-from cfx.policies.features import measured_history
 from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
+from cfx.policies.history import measured_history
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split, Windows, WindowSettings
@@ -188,7 +189,7 @@ def reads_no_frame_after_the_training_part(learner: Learner) -> None:
     frames = torch.arange(data.recorded.mask.shape[1])
     secret = frames > data.pairs.split.frame[:, None]
     changed: dict[str, Any] = {}
-    for name in SIGNALS:
+    for name in RECORDED:
         signal = getattr(data.recorded, name)
         changed[name] = torch.where(secret, 3.0 + 0.5 * signal, signal)
     poisoned = replace(data, recorded=replace(data.recorded, **changed))
@@ -203,7 +204,7 @@ def networks_are_independent(learner: Learner) -> None:
     data = training_data(needs_labels=learner.needs_labels)
     first = torch.arange(PAIRS)[:, None] == 0
     changed: dict[str, Any] = {}
-    for name in SIGNALS:
+    for name in RECORDED:
         if not name.endswith("position"):
             signal = getattr(data.recorded, name)
             changed[name] = torch.where(first, 1.0 + 0.8 * signal, signal)
@@ -229,7 +230,7 @@ def the_training_data_stays_as_it_is(learner: Learner) -> None:
     untouched = training_data(needs_labels=learner.needs_labels)
     _, data = _fit(learner, training_data(needs_labels=learner.needs_labels))
     message = "must not be changed in place: the protocol still needs it for the evaluation"
-    for name in (*SIGNALS, "gap"):
+    for name in (*RECORDED, "gap"):
         one, two = getattr(data.recorded, name), getattr(untouched.recorded, name)
         assert torch.equal(one, two), f"recorded.{name} of the training data {message}"
     for name in ("fixed", "network"):

@@ -154,6 +154,8 @@ def _usage(kind: registry.Kind, name: str) -> str:
     arguments = kind.call(name).removeprefix("cfx ")
     if kind.name in {"metric", "table"}:
         arguments = f"{kind.group}{'' if kind.name == 'metric' else 's'}=[own,{name}]"
+    if kind.name == "input":
+        arguments = f"policy.inputs=[situation,{name}]"
     if kind.name == "dataset":
         arguments += " data.path=FILE.csv"
     if kind.name == "command":

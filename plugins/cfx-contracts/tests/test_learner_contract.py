@@ -12,7 +12,9 @@ from torch import Tensor
 
 from cfx.learners.base import CURVE_COLUMNS, Learner, TrainingData, TrainingResult
 from cfx.policies.base import Policy, PolicyNetwork
-from cfx.policies.features import Scaler, measured_history, tokens
+from cfx.policies.features import Scaler, tokens
+from cfx.policies.history import measured_history
+from cfx.policies.inputs import policy_inputs
 from cfx_contracts import learners as checks
 
 EPOCHS = 12
@@ -33,7 +35,8 @@ class Plain(Learner):
             training_data.windows.length,
         )
         seen, mask = windows.to_grid(
-            tokens(history, policy.inputs, policy.summary).float(), len(training_data.batch)
+            tokens(history, policy_inputs(policy.inputs), policy.summary).float(),
+            len(training_data.batch),
         )
         space = training_data.simulator.model.space
         wanted, _ = windows.to_grid(

@@ -24,9 +24,12 @@ from cfx.policies.checkpoint import load_agent, save_agent
 from cfx.policies.core import AgentCore
 from cfx.policies.driver_step import DriverStep, Motion
 from cfx.results.tracker import folder_of
-from cfx_drivers.onnx.export import OnnxExport
+from cfx_drivers.gym.drivers import driver_step
+from cfx_drivers.onnx.agreement import largest_difference
+from cfx_drivers.onnx.export import MOST_DIFFERENCE, OnnxExport
 from cfx_drivers.onnx.graph import graph_of
 from tests.agents import adaptive
+from tests.further import known_inputs
 
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 PLATOON = EXAMPLES / "platoon.py"
@@ -160,6 +163,20 @@ class Branching(PolicyNetwork):
         if bool((tokens > 0).any()):
             return torch.zeros(shape), state
         return torch.ones(shape), state
+
+
+def test_further_signals_are_inputs_of_the_graph() -> None:
+    with known_inputs():
+        step = DriverStep(adaptive({"name": "idm"}, further=("rain", "second_leader")))
+        graph = graph_of(step, "here")
+        assert largest_difference(step, graph.SerializeToString()) <= MOST_DIFFERENCE
+        with pytest.raises(ConfigError, match=r"'rain' reads the signal 'rain'.*this environment"):
+            driver_step(step.agent)
+    about = {one.key: one.value for one in graph.metadata_props}
+    assert about["cfx.signals"].split()[5:] == ["rain", "second_leader_gap", "second_leader_speed"]
+    assert (about["unit.rain"], about["meaning.rain"]) == ("mm/h", "rainfall")
+    names = [tensor.name for tensor in graph.graph.input]
+    assert {"rain", "second_leader_gap", "second_leader_speed"} <= set(names)
 
 
 def test_a_policy_that_is_no_graph_is_refused() -> None:

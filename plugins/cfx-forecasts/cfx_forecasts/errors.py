@@ -82,19 +82,18 @@ def forecast_values(table: pd.DataFrame) -> pd.DataFrame:
     return pd.concat(parts, ignore_index=True)
 
 
-def forecast_metrics(table: pd.DataFrame, seed: int) -> dict[str, float]:
+def forecast_metrics(table: pd.DataFrame) -> dict[str, float]:
     """Returns the metrics of forecasts under their names in metrics.json and MLflow.
 
     `forecast/ERROR_HORIZON/METHOD`, such as `forecast/rmse_speed_0.5s/policy`, is the mean over
     drivers; ERROR is one of `ERRORS`. `forecast/ERROR_HORIZON/METHOD/ci95_low` and `ci95_high` are
-    its 95 % bootstrap interval over drivers, of `rmse_speed` and `rmse_position`.
+    its 95 % interval over drivers, of `rmse_speed` and `rmse_position`.
 
     Args:
         table: of single forecasts.
-        seed: of the bootstrap.
     """
     found = {}
-    for row in summarize_forecasts(table, seed).to_dict("records"):
+    for row in summarize_forecasts(table).to_dict("records"):
         for error in ERRORS:
             key = f"{SCOPE}/{metric_name(error, row['horizon_s'])}/{row['method']}"
             found[key] = float(row[error])
@@ -181,17 +180,16 @@ def errors_by(table: pd.DataFrame, groups: Sequence[str]) -> pd.DataFrame:
     return found.reset_index()
 
 
-def summarize_forecasts(table: pd.DataFrame, seed: int, by: str = "horizon_s") -> pd.DataFrame:
+def summarize_forecasts(table: pd.DataFrame, by: str = "horizon_s") -> pd.DataFrame:
     """Returns the mean over drivers of the errors over each driver's origins.
 
     Args:
         table: of single forecasts.
-        seed: of the bootstrap.
         by: column that tells the forecasts of a method from one another.
 
     Returns:
         A row per method and value of `by`, with columns for each error; `rmse_speed_low`,
-        `rmse_speed_high`, `rmse_position_low` and `rmse_position_high`, the 95 % bootstrap interval
+        `rmse_speed_high`, `rmse_position_low` and `rmse_position_high`, the 95 % interval
         over drivers; drivers and origins, how many there are.
     """
     rows = []
@@ -201,7 +199,7 @@ def summarize_forecasts(table: pd.DataFrame, seed: int, by: str = "horizon_s") -
         row |= {error: float(found[error].mean()) for error in ERRORS}
         drivers = found["driver"].astype(str).tolist()
         for error in _QUADRATIC:
-            _, low, high = statistics.mean_interval(found[error].tolist(), drivers, seed=seed)
+            _, low, high = statistics.mean_interval(found[error].tolist(), drivers)
             row |= {f"{error}_low": low, f"{error}_high": high}
         row |= {"drivers": len(found), "origins": int(found["origins"].sum())}
         rows.append(row)

@@ -24,6 +24,7 @@ from cfx.plugin import (
     ProtocolContext,
     ProtocolResult,
     Settings,
+    base_of,
     forecasts,
     in_text,
 )
@@ -96,7 +97,7 @@ class Forecast(FoldsOrFinished):
     before the first origin.
 
     Errors of speed and position at each horizon are the RMSE over the origins of a driver, then the
-    mean over drivers, with a bootstrap interval over drivers: origins of one driver overlap and are
+    mean over drivers, with an interval over drivers: origins of one driver overlap and are
     not independent. ADE and FDE are the mean absolute error of position over the way to a horizon,
     and at it. A horizon counts the origins whose recording lasts that long.
 
@@ -223,7 +224,7 @@ class Forecast(FoldsOrFinished):
         fixed = context.calibrator.fixed(test.pairs, test.batch, first.cpu())
         base = test.base
         if base is not None:
-            base = test.policy.base_of(fixed)
+            base = base_of(test.policy, fixed)
         return replace(test, first=first, fixed=fixed, base=base)
 
     def _paths(
@@ -263,7 +264,7 @@ class Forecast(FoldsOrFinished):
             agent = constant_with_noise(context, parameters, *noise)
             if can_drive(context.simulator, agent):
                 agents[f"{name}_ar"] = (agent, each)
-        if test.policy.is_stochastic:
+        if test.policy.core.head.is_stochastic:
             agents["policy"] = (test.policy, test.network)
         paths = {}
         for name, (agent, network) in agents.items():

@@ -42,7 +42,7 @@ class ForecastsSection(Section):
     order = 700
     figures = ("forecasts", "forecasts_by_history")
     template = """
-<p>{{ caption("forecasts") }} In the tables, the smaller line below is its 95 % bootstrap interval
+<p>{{ caption("forecasts") }} In the tables, the smaller line below is its 95 % interval
 over drivers. Origins of one driver overlap, so they are never counted as independent.</p>
 <p>Methods: {{ methods }}</p>
 {% for one in forecasts %}

@@ -21,6 +21,7 @@ class ForecastErrors(ResultTable):
 
     meaning = "the error of every single forecast (`protocol=forecast`)"
     order = 120
+    always_printed = True
     columns = (
         PAIR,
         DRIVER,
@@ -33,7 +34,7 @@ class ForecastErrors(ResultTable):
     )
 
     def metrics(self, evaluation: Evaluation) -> dict[str, float]:
-        return forecast_metrics(evaluation.tables["forecasts"], evaluation.seed)
+        return forecast_metrics(evaluation.tables["forecasts"])
 
     def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[Table]:
         """Returns the RMSE of speed of each method at each horizon: mean over drivers."""
@@ -56,6 +57,7 @@ class Distributions(ResultTable):
 
     meaning = "scores of sampled forecasts, a row per origin (`protocol.samples`)"
     order = 130
+    always_printed = True
     columns = (
         PAIR,
         DRIVER,

@@ -30,7 +30,7 @@ from tests.made_up import (
 
 def test_forecasts_have_a_line_per_method() -> None:
     forecasts = make_forecasts()
-    summary, methods = summarize_forecasts(forecasts, 0), forecast_methods(forecasts)
+    summary, methods = summarize_forecasts(forecasts), forecast_methods(forecasts)
     by_horizon = draw_by_horizon(summary, methods).axes
     for axes, error in zip(by_horizon, ("rmse_speed", "rmse_position"), strict=True):
         assert axes.get_yscale() == "log"

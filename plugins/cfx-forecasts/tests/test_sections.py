@@ -21,7 +21,7 @@ def test_forecasts_have_plots_and_tables(tmp_path: Path) -> None:
     metrics = write_job(tmp_path / "job", pairs=4)
     forecasts = make_forecasts(drivers=4)
     forecasts.to_parquet(tmp_path / "job" / "forecasts.parquet", index=False)
-    found = {**metrics, **forecast_metrics(forecasts, 0)}
+    found = {**metrics, **forecast_metrics(forecasts)}
     (tmp_path / "job" / "metrics.json").write_text(json.dumps(found))
     page = Page(render(read_runs([str(tmp_path)])))
     assert "forecasts" in page.having("id")

@@ -77,12 +77,18 @@ def pairs_of(
         labels = [values[good] for values in one.labels.values()]
         starts, sizes = tracks.runs(one.frame[good] - np.arange(len(good)), *labels)
         is_pair = sizes > 1
-        lost += tracks.counted({**reasons, tracks.SINGLE_FRAME: sizes < 2}, "rows")
+        lost += tracks.count_reasons({**reasons, tracks.SINGLE_FRAME: sizes < 2}, "rows")
         stops = starts + sizes
-        ends += tracks.counted(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
+        ends += tracks.count_reasons(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
         for start, stop in zip(starts[is_pair].tolist(), stops[is_pair].tolist(), strict=True):
             pairs.append(_pair(one, slice(good[start], good[stop - 1] + 1), seen))
-    return PairSet(tuple(pairs), source, tracks.summed(lost), tracks.summed(ends), tuple(remarks))
+    return PairSet(
+        tuple(pairs),
+        source,
+        tracks.totals_by_reason(lost),
+        tracks.totals_by_reason(ends),
+        tuple(remarks),
+    )
 
 
 def _left_out(one: Series, max_gap: float | None) -> dict[str, tracks.Marks]:
@@ -104,7 +110,7 @@ def _left_out(one: Series, max_gap: float | None) -> dict[str, tracks.Marks]:
         "the leader is behind its follower (gap of 0 or less)": gap <= 0,
         f"the leader is farther than {furthest:g} m": gap > furthest,
     }
-    return tracks.first_of(reasons)
+    return tracks.first_that_holds(reasons)
 
 
 def _ends(one: Series, reasons: Mapping[str, tracks.Marks], last: Ints) -> dict[str, tracks.Marks]:
@@ -120,7 +126,7 @@ def _ends(one: Series, reasons: Mapping[str, tracks.Marks], last: Ints) -> dict[
         found[reason] = holds[after]
     for label, values in one.labels.items():
         found[f"the {label.replace('_', ' ')} changes"] = values[after] != values[last]
-    return tracks.first_of(found)
+    return tracks.first_that_holds(found)
 
 
 def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
@@ -131,7 +137,7 @@ def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
     if one.gap is not None:
         leader = signals.get("leader_position")
         if leader is None:
-            leader = tracks.driven(signals["leader_speed"], one.dt) + one.leader_length
+            leader = tracks.distance_driven(signals["leader_speed"], one.dt) + one.leader_length
         signals["leader_position"] = leader
         signals["follower_position"] = leader - one.leader_length - one.gap[run]
     for who in ("leader", "follower"):

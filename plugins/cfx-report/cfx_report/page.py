@@ -167,7 +167,7 @@ def summary(jobs: Sequence[Result]) -> list[str]:
         references.append(f"{len(constant)} jobs are calibrations, without adaptation.")
     if len(compared) <= _MOST:
         return [first, *map(_verdict, compared), *warnings, *references]
-    counts = f"{_counts(compared)} (by the 95 % interval of the mean improvement)."
+    counts = f"{_counts(compared)} (by the 95 % interval of the improvement)."
     return [first, counts, _best(jobs), *warnings, *references]
 
 
@@ -207,8 +207,8 @@ def _best(jobs: Sequence[Result]) -> str:
             rows.append(row)
     best = max(rows, key=_mean_for_ranking)
     if len(best.jobs) == 1:
-        return f"The best mean: {_verdict(best.jobs[0])}"
-    gains = best.improvements("mean", "fixed")
+        return f"The best: {_verdict(best.jobs[0])}"
+    gains = best.improvements("geometric", "fixed")
     least, most = (wording.percent(float(end), 1) for end in (np.nanmin(gains), np.nanmax(gains)))
     return (
         f"The best mean over seeds: {best.name}. Improvement of the RMSE of speed:"
@@ -218,7 +218,7 @@ def _best(jobs: Sequence[Result]) -> str:
 
 
 def _mean_for_ranking(row: Row) -> float:
-    means = row.improvements("mean", "fixed")
+    means = row.improvements("geometric", "fixed")
     known = means[np.isfinite(means)]
     return float(known.mean()) if len(known) else -np.inf
 
@@ -265,7 +265,7 @@ def _side(job: Result, baseline: str = "fixed") -> str:
 
 
 def _verdict(job: Result) -> str:
-    if not np.isfinite(job.statistics("fixed").mean):
+    if not np.isfinite(job.statistics("fixed").geometric):
         return f"{job.name}: no pair has a defined improvement."
     pooled = ""
     if "population" in job.baselines():
@@ -275,13 +275,13 @@ def _verdict(job: Result) -> str:
 
 
 def _gain(job: Result, baseline: str) -> str:
-    mean = job.statistics(baseline).mean
-    low, high = job.statistics(baseline).ci95_low, job.statistics(baseline).ci95_high
-    if not np.isfinite(mean):
+    improvement = job.statistics(baseline)
+    low, high = improvement.ci95_low, improvement.ci95_high
+    if not np.isfinite(improvement.geometric):
         return "not defined"
     sure = "no interval for a single driver"
     if np.isfinite(low):
         sure = f"95 % interval {wording.percent(low, 1)} to {wording.percent(high, 1)}"
-    said = f"{wording.percent(mean, 1)} on average ({sure})"
-    opposite = headline.contradiction(job.metrics, headline.Comparison(baseline, wording.TEST))
-    return f"{said}, {opposite}" if opposite else said
+    said = f"{wording.percent(improvement.geometric, 1)} ({sure})"
+    note = headline.summaries_disagree(improvement.geometric, improvement.ratio_of_means)
+    return f"{said}, {note}" if note else said

@@ -70,7 +70,7 @@ def frame(rows: Sequence[Row]) -> pd.DataFrame:
                 values |= _spread(f"{metric}{unit}/{method}", row.values(metric, method))
         for baseline in baselines_of(rows):
             name = f"improvement/{baseline}"
-            values |= _spread(name, row.improvements("mean", baseline))
+            values |= _spread(name, row.improvements("geometric", baseline))
             if len(row.jobs) == 1:
                 for end in ("ci95_low", "ci95_high"):
                     values[f"{name}/{end}"] = row.improvements(end, baseline)[0]
@@ -102,7 +102,7 @@ def latex(rows: Sequence[Row]) -> str:
     if several:
         caption += "; mean and standard deviation over the jobs of a row"
     elif any_adapts(rows):
-        caption += "; improvements with their 95 \\% bootstrap interval over drivers"
+        caption += "; improvements with their 95 \\% interval over drivers"
     body = _latex_table(pd.DataFrame(cells).fillna("--"), f"{caption}.", "tab:cfx")
     comments = ["% Needs \\usepackage{booktabs}."]
     for row in rows:
@@ -180,7 +180,7 @@ def _text(values: np.ndarray, digits: int = 3) -> str:
 
 
 def _improvement(row: Row, baseline: str) -> str:
-    values = row.improvements("mean", baseline)
+    values = row.improvements("geometric", baseline)
     known = 100 * values[np.isfinite(values)]
     if not len(known):
         return "--"

@@ -129,13 +129,13 @@ def _compared(jobs: Sequence[Result], folder: Path, formats: Sequence[str]) -> l
     from cfx_report.figures.models import draw_models
 
     errors = {job.name: job.errors for job in jobs}
-    compared = statistics.against_the_best(errors)
-    if not compared:
+    ranking = statistics.ranking_of(errors)
+    if not ranking.against:
         return ["The jobs share no pairs on the same frames, so that they are not compared."]
-    figure = draw_models(errors, compared)
+    figure = draw_models(errors, ranking.against)
     paths = [drawing.write_figure(figure, folder / f"models.{form}") for form in formats]
     return [
-        statistics.verdict(compared),
+        statistics.verdict(ranking),
         *[f"Model against model: {path.absolute()}" for path in paths],
     ]
 

@@ -63,7 +63,7 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
                 f"{job.metrics['rmse_speed/fixed']:.3f} {job.metrics['rmse_gap/fixed']:.2f}"
             ]
             assert row["over driver-specific"][0].startswith(
-                f"{100 * job.metrics['rmse_improvement/mean']:+.1f} %".replace("-", "\u2212")
+                f"{100 * job.metrics['rmse_improvement/geometric']:+.1f} %".replace("-", "\u2212")
             )
     assert sum(span for _, span in sheet.groups) == len(sheet.columns)
 

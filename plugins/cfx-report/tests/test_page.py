@@ -146,7 +146,14 @@ def test_the_tables_hold_the_numbers_of_metrics_json(clusters: Clusters) -> None
                 for row in gains
                 if row[:3] == [name, shown, frames.replace(" ", "\N{NO-BREAK SPACE}")]
             )
-            names = ("mean", "ci95_low", "trimmed_mean", "median", "win_rate", "p_value")
+            names = (
+                "geometric",
+                "ci95_low",
+                "ratio_of_means",
+                "median",
+                "win_rate",
+                "p_value",
+            )
             assert [float(cell) for cell in row[3:9]] == [
                 values[f"{prefix}/{one}"] for one in names
             ]
@@ -261,7 +268,7 @@ def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) ->
     assert not any("5 s" in name for view in views for name in view)  # test parts may be no longer
     steady = {
         f"steady/rmse_improvement/fixed/{name}": 0.1
-        for name in ("mean", "ci95_low", "ci95_high", "trimmed_mean", "median")
+        for name in ("geometric", "ci95_low", "ci95_high", "ratio_of_means", "median")
     }
     errors = {f"steady/rmse_speed/{method}": 0.5 for method in ("default", "fixed", "policy")}
     (tmp_path / "a" / "metrics.json").write_text(json.dumps(metrics | steady | errors))
@@ -309,17 +316,15 @@ def test_the_summary_answers_by_the_interval(tmp_path: Path) -> None:
     metrics = json.loads(path.read_text(encoding="utf-8"))
     for low, high, answer in ((0.1, 0.3, "yes"), (-0.3, -0.1, "no"), (-0.1, 0.1, "undecided")):
         changed = {
-            "rmse_improvement/mean": 0.123,
+            "rmse_improvement/geometric": 0.123,
             "rmse_improvement/ci95_low": low,
             "rmse_improvement/ci95_high": high,
         }
         path.write_text(json.dumps(metrics | changed), encoding="utf-8")
         question, said, warning = summary(read_runs([str(tmp_path)]).jobs)
-        assert "with fewer than 20, means and intervals say little" in warning
+        assert "with fewer than 10, an improvement says little" in warning
         assert question.startswith("8 pairs of leader and follower from recording.parquet")
-        assert said.startswith(
-            f"krauss: {answer}. Improvement of the RMSE of speed: +12.3 % on average"
-        )
+        assert said.startswith(f"krauss: {answer}. Improvement of the RMSE of speed: +12.3 %")
 
 
 def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> None:
@@ -330,7 +335,7 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert any("a calibration; its parameters stay constant" in line for line in said)
     assert sum("Improvement of the RMSE of speed" in line for line in said) == 1
     view = overview(runs.jobs)["against driver-specific calibration"]
-    assert view.svg.count("<title>") == 3, "mean, trimmed mean and median of one job"
+    assert view.svg.count("<title>") == 3, "improvement, that of the means and median of one job"
     alone = [job for job in runs.jobs if job.purpose is Purpose.CALIBRATION]
     assert "with constant parameters?" in summary(alone)[0]
     page = page_of(tmp_path / "still")
@@ -338,7 +343,7 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
     assert "The numbers are those of driver-specific calibration" in page.words
     for said_of_policies in ("The numbers are the policy", "policy has learned", "is learned"):
         assert said_of_policies not in page.words
-    assert "policy" not in alone[0].meaningful_methods, "a constant set is shown once"
+    assert "policy" not in alone[0].shown_methods, "a constant set is shown once"
     (moves,) = [job for job in runs.jobs if job.purpose is Purpose.ADAPTATION]
     sheet = improvements.clusters(cluster_series([moves]), "fixed")
     found = improvements.ClustersSection().context(runs)
@@ -390,7 +395,7 @@ def test_the_papers_figures_stand_beside_those_of_its_experiments(
     assert "the search (here random; there Bayesian optimization)" in said
     _, metrics, page = clusters
     low, high = (
-        metrics[f"w99 · {c}"]["rmse_improvement/population/mean"] or 0.0
+        metrics[f"w99 · {c}"]["rmse_improvement/population/mean_ratio"] or 0.0
         for c in ("conservative", "aggressive")
     )
     does = "fares better" if high > low else "fares no better"

@@ -49,7 +49,7 @@ def test_a_row_of_seeds_has_their_mean_and_spread(sweep: Path) -> None:
         for seed in SEEDS:
             metrics = json.loads((sweep / f"{model}-{seed}" / "metrics.json").read_text())
             values.append(metrics["rmse_speed/policy"])
-            gains.append(metrics["rmse_improvement/mean"])
+            gains.append(metrics["rmse_improvement/geometric"])
         assert row["rmse_speed_mps/policy"] == pytest.approx(np.mean(values))
         assert row["rmse_speed_mps/policy/sd"] == pytest.approx(np.std(values, ddof=1))
         assert row["improvement/fixed"] == pytest.approx(np.mean(gains))

@@ -186,7 +186,7 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         driver_types=types,
         ids_are_unique=True,
         names=("", *names.tolist()),
-        dropped=(*rows.dropped, *tracks.counted(left_out, "rows")),
+        dropped=(*rows.dropped, *tracks.count_reasons(left_out, "rows")),
         remarks=remarks,
     )
     if gap is not None:
@@ -260,10 +260,7 @@ def _types(rows: FcdRows) -> tuple[tuple[str, ...], Ints]:
 def _warn_of_lengths(rows: FcdRows, types: tuple[str, ...], settings: SumoFcdSettings) -> None:
     """Warns of vTypes whose length is nothing but the default: their gaps may be wrong."""
     known = _LENGTH_IS_SUMOS | set(settings.lengths or {})
-    guessed = []
-    for name in types:
-        if name not in known:
-            guessed.append(name)
+    guessed = [name for name in types if name not in known]
     if guessed:
         log.warning(
             "%s does not say how long vehicles are: those of type %s count as %g m, and gaps behind"

@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
+from cfx.data.signals import OBSERVED
 from cfx.errors import SumoError
-from cfx.policies.features import History
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.driver import Driver
 from cfx_sumo.live.fleet import Fleet
@@ -124,7 +124,7 @@ def test_history_holds_what_the_leader_did_within_a_long_step() -> None:
     driver = Driver(adaptive({"name": "idm"}, length=8), speed_mode=0)
     Motion(0.5).go(lambda road: driver.step(road, "car"))
     history = driver._vehicles.table.history[driver._vehicles.row("car")]
-    speeds = history[History._fields.index("leader_speed")].tolist()
+    speeds = history[OBSERVED.index("leader_speed")].tolist()
     # The frame at 30 s is followed by four that are expected; before it are those of a past step.
     end = len(speeds) - 5
     for number in range(4):

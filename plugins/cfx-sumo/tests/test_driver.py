@@ -48,7 +48,7 @@ def counted(policy: Agent, monkeypatch: pytest.MonkeyPatch) -> list[int]:
     original = Agent.act
 
     def act(self: Agent, history: Any, state: Any, **options: Any) -> tuple[Tensor, Any]:
-        calls.append(len(history.gap))
+        calls.append(len(history["gap"]))
         return original(self, history, state, **options)
 
     monkeypatch.setattr(Agent, "act", act)
@@ -630,7 +630,7 @@ def test_the_package_gives_the_driver_and_imports_no_sumo() -> None:
 
 
 def _baseline(policy: Agent, component: Any, pairs: int) -> Agent:
-    space = policy.model_space
+    space = policy.core.head.model_space
     unit = space.to_unit(space.defaults()).expand(pairs, -1)
     blank = torch.zeros((pairs, 1)).double()
     names = tuple(str(i) for i in range(pairs))

@@ -100,14 +100,18 @@ def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> No
     for name, value in {"a": 12.5, "b": 13.5}.items():
         folder = tmp_path / name
         folder.mkdir()
-        metrics = {"rmse_improvement/mean": 0.1, "mean_gap/policy": value, "theil_u/policy": 0.01}
+        metrics = {
+            "rmse_improvement/geometric": 0.1,
+            "mean_gap/policy": value,
+            "theil_u/policy": 0.01,
+        }
         (folder / "metrics.json").write_text(json.dumps(metrics))
         (folder / "data.json").write_text(json.dumps({"metrics": [info, hidden]}))
         statuses[folder] = JobStatus(0, "", "", (f"model={name}",))
     # A job may say nothing of its metrics.
     old = tmp_path / "old"
     old.mkdir()
-    (old / "metrics.json").write_text(json.dumps({"rmse_improvement/mean": 0.2}))
+    (old / "metrics.json").write_text(json.dumps({"rmse_improvement/geometric": 0.2}))
     (old / "data.json").write_text("{}")
     statuses[old] = JobStatus(0, "", "", ("model=old",))
 

@@ -12,13 +12,15 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from scipy.stats import gmean
 
 import cfx
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.data.pairs import SIGNALS, PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.signals import RECORDED
 from cfx.data.tidy import write_tidy
 from cfx.errors import DataError
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
@@ -29,13 +31,14 @@ from cfx.models.krauss import Krauss
 from cfx.policies.base import Policy
 from cfx.policies.constant import DefaultPolicy, FixedPolicy
 from cfx.policies.core import Ensemble
-from cfx.policies.features import History
 from cfx.policies.gru import GruPolicy
+from cfx.policies.prediction import networks_for
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split, WindowSettings
 from cfx_contracts import protocols
 from tests.drives import straight_pairs, wavy_pairs
+from tests.histories import observed
 
 QUICK = [
     "debug=quick",
@@ -236,7 +239,9 @@ def test_every_baseline_has_its_improvement(result: cfx.plugin.Result) -> None:
     ):
         before = result.pairs[result.pairs.method == baseline].set_index("pair_id")
         gain = (before.rmse_speed - policy.rmse_speed) / before.rmse_speed
-        assert result.metrics[f"{key}/mean"] == pytest.approx(gain.mean())
+        geometric = 1 - gmean(1 - gain)
+        assert result.metrics[f"{key}/geometric"] == pytest.approx(geometric)
+        assert result.metrics[f"{key}/mean_ratio"] == pytest.approx(gain.mean())
         column = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
         assert policy[column].to_numpy() == pytest.approx(gain.to_numpy())
         whole = (
@@ -244,8 +249,8 @@ def test_every_baseline_has_its_improvement(result: cfx.plugin.Result) -> None:
         ) / before.full_trajectory_rmse_speed
         if baseline == "population":
             assert result.metrics[
-                "full_trajectory/rmse_improvement/population/mean"
-            ] == pytest.approx(whole.mean())
+                "full_trajectory/rmse_improvement/population/geometric"
+            ] == pytest.approx(1 - gmean(1 - whole))
         else:
             assert whole.isna().all(), (
                 "driver-specific parameters have seen the first part of the trajectory"
@@ -281,7 +286,7 @@ def test_trajectories_and_curves_are_kept(result: cfx.plugin.Result) -> None:
 def test_the_saved_policy_drives_unseen_drivers(result: cfx.plugin.Result) -> None:
     policy = cfx.load(result.folder).policy
     unseen = SyntheticDataset(pairs=2, frames=100, seed=9).load()
-    assert policy.networks_for(unseen).tolist() == [3, 3]
+    assert networks_for(policy, unseen).tolist() == [3, 3]
 
 
 def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_them() -> None:
@@ -295,7 +300,7 @@ def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_them() -> N
     first, second = before.evaluation.table, after.evaluation.table
     fold = int(first.fold.iloc[0])
     assert fold == int(second.fold.iloc[0])
-    one, two = before.policy.network.state_dict(), after.policy.network.state_dict()
+    one, two = before.policy.core.network.state_dict(), after.policy.core.network.state_dict()
     assert all(torch.equal(one[key][fold], two[key][fold]) for key in one)
     others = [k for k in range(3) if k != fold]
     assert all(any(not torch.equal(one[key][k], two[key][k]) for key in one) for k in others)
@@ -371,10 +376,12 @@ def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(
     assert again.base is not None
     assert torch.equal(again.base, learned.policy.base)  # type: ignore[arg-type]  # it has one
     assert again.context_rule.shrinkage == learned.policy.context_rule.shrinkage == 0.7
-    assert isinstance(again.network, Ensemble)
-    assert again.network.size == 2
-    kept = learned.policy.network.state_dict()
-    assert all(torch.equal(value, kept[key]) for key, value in again.network.state_dict().items())
+    assert isinstance(again.core.network, Ensemble)
+    assert again.core.network.size == 2
+    kept = learned.policy.core.network.state_dict()
+    assert all(
+        torch.equal(value, kept[key]) for key, value in again.core.network.state_dict().items()
+    )
     assert {
         "hard_braking/policy",
         "jerk/policy",
@@ -414,7 +421,7 @@ def test_without_learning_the_policy_is_its_base(base: str, shrinkage: float, me
     # What drawing does on its own is shown where it was done.
     is_drawn = base == "own" and shrinkage > 0
     assert ("shrunk" in rmse.index.get_level_values(0)) == is_drawn
-    assert ("rmse_improvement/shrunk/mean" in found.metrics()) == is_drawn
+    assert ("rmse_improvement/shrunk/geometric" in found.metrics()) == is_drawn
     assert "history" not in found.tables
 
 
@@ -438,12 +445,12 @@ def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> No
     for policy in (result.policy, cfx.load(tmp_path / "one").policy):
         largest = float(Krauss().space["t_r"].high)
         assert policy.space["t_r"].high == 60 > largest
-        for weights in policy.network.parameters():
+        for weights in policy.core.network.parameters():
             weights.data.fill_(0.0)
-        policy.network.get_parameter("members.b_out").data.fill_(
+        policy.core.network.get_parameter("members.b_out").data.fill_(
             20.0
         )  # as large an answer as there is
-        silence = History(
+        silence = observed(
             *(torch.zeros((1, policy.windows.length), dtype=torch.float64) for _ in range(5))
         )
         anywhere = replace(policy, valid_range=None)  # it has learned nothing from silence
@@ -531,7 +538,7 @@ def test_trajectories_that_are_too_short_to_test_change_what_is_learned(tmp_path
     )
     cut = []
     for pair, count in zip(pairs, frames, strict=True):
-        signals: dict[str, Any] = {name: getattr(pair, name)[:count] for name in SIGNALS}
+        signals: dict[str, Any] = {name: getattr(pair, name)[:count] for name in RECORDED}
         cut.append(replace(pair, **signals))
     write_tidy(PairSet(tuple(cut), "test"), tmp_path / "pairs.csv")
     options = [

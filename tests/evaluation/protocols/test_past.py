@@ -21,6 +21,7 @@ from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
 from cfx.evaluation.result import Array, Evaluation
 from cfx.policies.checkpoint import load_agent
 from cfx.policies.context import ExpectedError, conformal_bound
+from cfx.policies.known_drivers import driver_features_of, unlikeness
 from cfx.policies.ready import folder_of_ready_made
 from cfx.results.tables import Past
 
@@ -147,10 +148,13 @@ def test_drivers_are_unlike_those_learned_from_by_standard_deviations() -> None:
         folder_of_ready_made("cfx://i80-idm-history") / "policy"
     ).for_unseen_drivers()
     count = len(agent.core.driver_features)
-    mean, scale = agent.scaler.mean[0, -count:].double(), agent.scaler.scale[0, -count:].double()
+    mean, scale = (
+        agent.core.scaler.mean[0, -count:].double(),
+        agent.core.scaler.scale[0, -count:].double(),
+    )
     away = torch.tensor([0.0, 1.0, -2.0, 5.0, 0.5, float("nan")], dtype=torch.float64)
     network = torch.zeros(1, dtype=torch.int64)
-    found = agent.unlikeness((mean + away * scale)[None], network)
+    found = unlikeness(agent, (mean + away * scale)[None], network)
     torch.testing.assert_close(found[0], away, equal_nan=True)
 
 
@@ -182,9 +186,9 @@ def test_a_motorway_is_unlike_the_congestion_that_was_learned_from(shared_data: 
     for name in ("i80_reconstructed", "openacc_vicolungo"):
         pairs = TidyDataset(path=str(shared_data / f"{name}_pairs.parquet"), min_duration=30).load()
         batch = PairBatch.of(pairs)
-        features = agent.driver_features_of(batch, (0.8 * batch.lengths).long())
+        features = driver_features_of(agent, batch, (0.8 * batch.lengths).long())
         assert features is not None
-        away = agent.unlikeness(features, torch.zeros(len(pairs), dtype=torch.int64)).abs()
+        away = unlikeness(agent, features, torch.zeros(len(pairs), dtype=torch.int64)).abs()
         unlike[name] = float((away.max(1).values > 3).double().mean())
     assert unlike["i80_reconstructed"] < 0.05
     assert unlike["openacc_vicolungo"] > 0.75

@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 
+from cfx.data.pairs import PairBatch
 from cfx.learners.rollout.dataset import RolloutBatch, usual_time_gaps
 from cfx.learners.rollout.sampling import augmentation
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.window import RolloutInputs
-from cfx.policies.features import History
+from cfx.models.krauss import Krauss
+from cfx.policies.gru import GruPolicy
+from tests.drives import wavy_pairs
+from tests.further import known_inputs, with_surroundings
+from tests.histories import observed
 from tests.learners.made import TRUE, gru, module_of, training_data
 
 DATA = training_data(base=TRUE.repeat(2, 1))
@@ -52,6 +59,25 @@ def test_a_faster_road_moves_both_vehicles_alike() -> None:
     torch.testing.assert_close(gap, slow_gap + 22.5, rtol=1e-4, atol=1e-4)
 
 
+def test_further_signals_are_augmented_as_vehicles_are() -> None:
+    """On a faster and scaled road the second leader stays where they belong: 30 m, scaled, ahead."""
+    pairs = with_surroundings(wavy_pairs(Krauss(), TRUE, frames=260))
+    data = replace(training_data(base=TRUE.repeat(2, 1)), recorded=PairBatch.of(pairs))
+    with known_inputs():
+        policy = GruPolicy(inputs=("gap", "rain", "second_leader"), hidden_size=12)
+        made = module_of(data, policy=policy, cold_start_fraction=1.0, speed_shift=20.0)
+    pair = made.dataset.pair.gather(1, batch(0.0, 0.0).place)
+    changed = batch(15.0, 6.0)._replace(scale=torch.full((2, 3), 1.5))
+    recorded = made.dataset.recordings.batch
+    slow = RolloutInputs.of(recorded, pair, batch(0.0, 0.0), made.exact_step, 3)
+    fast = RolloutInputs.of(recorded, pair, changed, made.exact_step, 3)
+    rain, ahead, speed = 3, 4, 5
+    assert torch.equal(fast.leader[rain], slow.leader[rain])
+    torch.testing.assert_close(fast.leader[speed], slow.leader[speed] * 1.5 + 15.0)
+    rear = fast.leader[0] - fast.leader_length[..., None]
+    torch.testing.assert_close(fast.leader[ahead] - rear, torch.full_like(rear, 45.0))
+
+
 def test_some_cold_starts_are_faster_and_their_gap_fits() -> None:
     drawn = MODULE.sampler.training(0)
     assert drawn.shift is not None
@@ -79,13 +105,13 @@ def test_situations_are_augmented_as_trajectories_are() -> None:
     settings = RolloutSettings(scaling=0.0, speed_shift=20.0)
     time_gap = torch.tensor([1.0, 2.0], dtype=torch.float64)
     values = torch.full((2, 500), 5.0, dtype=torch.float64)
-    history = History(values, values * 0.1, values, values * 0.1, values * 2)
+    history = observed(values, values * 0.1, values, values * 0.1, values * 2)
     augment = augmentation(settings, time_gap, torch.Generator().manual_seed(0))
     after = augment(history, torch.arange(2))
-    shift = after.follower_speed - 5.0
-    torch.testing.assert_close(after.leader_speed - 5.0, shift)
-    torch.testing.assert_close(after.gap - 10.0, shift * time_gap[:, None])
-    torch.testing.assert_close(after.follower_acceleration, history.follower_acceleration)
+    shift = after["follower_speed"] - 5.0
+    torch.testing.assert_close(after["leader_speed"] - 5.0, shift)
+    torch.testing.assert_close(after["gap"] - 10.0, shift * time_gap[:, None])
+    torch.testing.assert_close(after["follower_acceleration"], history["follower_acceleration"])
     assert 0.2 < float((shift > 0).double().mean()) < 0.4
     assert float(shift.max()) <= 20.0
 

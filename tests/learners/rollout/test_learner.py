@@ -28,6 +28,7 @@ from cfx.policies.gru import GruPolicy
 from cfx.policies.lstm import LstmPolicy
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.windows import Split
+from tests.further import RAIN
 from tests.learners.made import (
     COMPILED,
     INPUTS,
@@ -190,6 +191,8 @@ def test_a_checkpoint_of_other_data_is_not_taken_up(tmp_path: Path) -> None:
     """Whatever is changed of the recordings or of what is learned from them gives another file."""
     policy, identity = gru(), RolloutLearner(**QUICK).identity()
     data = training_data(workspace=tmp_path, base=TRUE * 1.3)
+    rain = torch.ones_like(data.recorded.leader_speed)
+    data = replace(data, recorded=replace(data.recorded, surroundings={RAIN: rain}))
     others = []
     for name in ("recorded", "pairs"):
         record = getattr(data, name)
@@ -203,6 +206,8 @@ def test_a_checkpoint_of_other_data_is_not_taken_up(tmp_path: Path) -> None:
                 value = ("other",) * len(data.pairs)
             elif field.name == "dt":
                 value = 0.2
+            elif field.name == "surroundings":
+                value = {RAIN: rain + 1}
             else:
                 assert (field.name, value) == ("labels", None)
                 continue

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -9,6 +10,7 @@ import torch
 from torch import Tensor
 
 from cfx.core.threads import cores_limit, limit_cores
+from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout import RolloutSettings, scan, shard
 from cfx.learners.rollout.dataset import RolloutDataset
@@ -23,7 +25,10 @@ from cfx.policies.gru import GruPolicy
 from cfx.policies.heads import head_class
 from cfx.policies.lstm import LstmPolicy
 from cfx.simulation.kernel import compiler
-from tests.learners.made import INPUTS, QUICK, module_with, training_data
+from tests.drives import wavy_pairs
+from tests.further import INPUTS as FURTHER
+from tests.further import known_inputs, with_surroundings
+from tests.learners.made import INPUTS, QUICK, TRUE, module_with, training_data
 
 pytestmark = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C++ compiler")
 
@@ -97,6 +102,18 @@ def test_losses_and_gradients_are_those_of_pytorch(
     for one, two in zip(eager, compiled, strict=True):
         scale = float(one.abs().max())
         torch.testing.assert_close(two, one, rtol=2e-3, atol=2e-3 * scale)
+
+
+def test_further_signals_are_compiled_too() -> None:
+    with known_inputs():
+        policy = GruPolicy(inputs=(*INPUTS, *FURTHER), hidden_size=8, start="middle")
+        data = training_data(networks=2)
+        pairs = with_surroundings(wavy_pairs(Krauss(), TRUE, frames=260))
+        built = module(replace(data, recorded=PairBatch.of(pairs)), policy, **SETTINGS)
+        assert built.training_window in built.scans
+        eager, compiled = both(built, GradientPath(0.9, 1.0))
+    for one, two in zip(eager, compiled, strict=True):
+        torch.testing.assert_close(two, one, rtol=2e-3, atol=2e-3 * float(one.abs().max()))
 
 
 @pytest.mark.parametrize("path", [GradientPath(0.8, 0.5, through_motion=False), None])

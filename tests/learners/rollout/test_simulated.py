@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from cfx.data.pairs import SIGNALS
+from cfx.data.signals import RECORDED
 from cfx.learners.rollout import RolloutLearner
 from cfx.learners.rollout.simulated import SITE, simulated_drivers, with_simulated_drivers
 from tests.learners.made import QUICK, gru, training_data
@@ -29,7 +29,7 @@ def test_each_network_learns_from_them_beside_its_own_pairs(sites: tuple[str, ..
     assert torch.equal(found.base[~kept], data.pairs.fixed[:1].expand(10, -1))
     assert found.sites == ((sites or ("",) * 6)[:6] + (SITE,) * 5) * 2
     assert len(set(found.drivers or ())) == 11
-    for name in (*SIGNALS, "leader_length", "lengths", "mask"):
+    for name in (*RECORDED, "leader_length", "lengths", "mask"):
         assert torch.equal(getattr(more.recorded, name)[:recorded], getattr(data.recorded, name))
 
 

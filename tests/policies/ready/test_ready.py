@@ -13,7 +13,7 @@ from cfx.app import cli
 from cfx.app.job.steps import Parts, complete, make_protocol
 from cfx.errors import DataError
 from cfx.policies import checkpoint, ready
-from cfx.policies.features import History
+from tests.histories import observed
 
 NAMES = ready.names()
 
@@ -39,7 +39,7 @@ def test_each_drives_an_unseen_driver(name: str) -> None:
     assert agent.valid_range is not None
     assert agent.trained_on.quantiles
     frames = torch.full((1, agent.windows.length), 10.0, dtype=torch.float64)
-    history = History(frames, frames * 0, frames, frames * 0, frames * 2)
+    history = observed(frames, frames * 0, frames, frames * 0, frames * 2)
     chosen, state = agent.act(history, agent.begin(torch.zeros(1, dtype=torch.int64)))
     low, high = agent.space.bounds()
     assert bool(((chosen >= low - 1e-9) & (chosen <= high + 1e-9)).all())
@@ -77,9 +77,9 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
 )
 def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated(name: str, least: float) -> None:
     agent = cfx.load(f"cfx://{name}").policy
-    assert agent.is_stochastic
+    assert agent.core.head.is_stochastic
     frames = torch.full((2, agent.windows.length), 10.0, dtype=torch.float64)
-    history = History(frames, frames * 0, frames, frames * 0, frames * 2)
+    history = observed(frames, frames * 0, frames, frames * 0, frames * 2)
 
     def chosen(seed: int | None) -> torch.Tensor:
         generator = None if seed is None else torch.Generator().manual_seed(seed)
@@ -158,7 +158,7 @@ def test_a_policy_that_answers_what_its_model_does_not_use_is_tested_all_the_sam
     )
     protocol = make_protocol(config)
     model = Parts.of(complete(config, protocol), protocol).model
-    assert model.space.names == cfx.load("cfx://i80-w99").policy.model_space.names
+    assert model.space.names == cfx.load("cfx://i80-w99").policy.core.head.model_space.names
     assert "cc9" in model.space.names
 
 

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from cfx.errors import ConfigError
 from cfx.plugin import (
+    OBSERVED,
     DrivingModel,
     Follower,
     History,
@@ -69,7 +70,7 @@ class EstimatorPolicy(Policy):
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        return History._fields
+        return OBSERVED
 
     @property
     def summary(self) -> Summary:
@@ -193,9 +194,10 @@ class EstimatorNetwork(PolicyNetwork):
     def _history(self, token: Tensor) -> History:
         """Returns the newest frames that a token `(*batch, f)` holds, `(*batch, F)` each."""
         length, frames = self.driven.windows.length, self.driven.frames
-        signals = token[..., : length * len(History._fields)]
+        signals = token[..., : length * len(OBSERVED)]
         signals = signals.reshape(*token.shape[:-1], -1, length)
-        return History(*signals[..., length - frames :].unbind(-2))
+        newest = signals[..., length - frames :].unbind(-2)
+        return dict(zip(OBSERVED, newest, strict=True))
 
     def simulated_acceleration(self, history: History, sets: Tensor) -> Tensor:
         """Simulates a window from its first measured frame, behind the measured leader.
@@ -209,19 +211,19 @@ class EstimatorNetwork(PolicyNetwork):
         """
         model, dt, _ = self.driven
         p = model.space.unpack(model.space.from_unit(sets.sigmoid()))
-        moved = (history.follower_speed[..., 1:] * dt).cumsum(-1)
+        moved = (history["follower_speed"][..., 1:] * dt).cumsum(-1)
         travelled = torch.cat([torch.zeros_like(moved[..., :1]), moved], -1)
-        ahead = travelled + history.gap
-        speed = history.follower_speed[..., :1].expand(sets.shape[:-1])
-        acceleration = history.follower_acceleration[..., :1].expand(sets.shape[:-1])
+        ahead = travelled + history["gap"]
+        speed = history["follower_speed"][..., :1].expand(sets.shape[:-1])
+        acceleration = history["follower_acceleration"][..., :1].expand(sets.shape[:-1])
         follower = Follower(
             torch.zeros_like(speed), speed, acceleration, model.initial_memory(speed)
         )
         for frame in range(ahead.shape[-1] - 1):
             leader = Leader(
                 ahead[..., frame, None],
-                history.leader_speed[..., frame, None],
-                history.leader_acceleration[..., frame, None],
+                history["leader_speed"][..., frame, None],
+                history["leader_acceleration"][..., frame, None],
                 torch.zeros_like(ahead[..., :1]),
             )
             follower = advance_vehicle(model, follower, leader, p, dt)
@@ -229,7 +231,7 @@ class EstimatorNetwork(PolicyNetwork):
 
     def measured_acceleration(self, history: History) -> Tensor:
         """Returns the mean acceleration over the window, `(*batch,)`, m/s2."""
-        speed = history.follower_speed
+        speed = history["follower_speed"]
         return (speed[..., -1] - speed[..., 0]) / (self.driven.dt * (speed.shape[-1] - 1))
 
 

@@ -14,6 +14,7 @@ from pydantic import Field
 from torch import Tensor
 
 from cfx.plugin import (
+    OBSERVED,
     History,
     MemoryStepper,
     Objective,
@@ -28,7 +29,7 @@ from cfx.plugin import (
 )
 from cfx_community.policies.estimator import DrivenModel, EstimatorNetwork, EstimatorPolicy
 
-_SIGNALS = len(History._fields)
+_SIGNALS = len(OBSERVED)
 
 _MEMORY_BYTES = 1 << 28
 """Bound for what one search takes at once."""
@@ -114,7 +115,7 @@ class RecalibrateNetwork(EstimatorNetwork):
     def updated(self, history: History, belief: Tensor) -> Tensor:
         """Appends the frames of a window that are new; the estimate waits until it is asked for."""
         estimate, known, frames = self._parts(belief)
-        token = torch.stack(list(history), -2)
+        token = torch.stack([history[name] for name in OBSERVED], -2)
         new = torch.where(known > 0, _new_frames(frames[..., -1], token), token.shape[-1])
         index = torch.arange(self._kept, device=belief.device) + new[..., None]
         both = torch.cat([frames, token], -1)
@@ -164,24 +165,25 @@ class RecalibrateNetwork(EstimatorNetwork):
         """Returns the losses of D drivers over the frames that are known of them."""
         index = torch.arange(self._kept, device=frames.device) + (self._kept - known)[:, None]
         index = index.clamp(max=self._kept - 1)
-        signals = History(*frames.gather(-1, index[:, None].expand_as(frames)).unbind(-2))
-        moved = (signals.follower_speed[:, 1:] * self.driven.dt).cumsum(-1)
+        known_frames = frames.gather(-1, index[:, None].expand_as(frames))
+        signals = dict(zip(OBSERVED, known_frames.unbind(-2), strict=True))
+        moved = (signals["follower_speed"][:, 1:] * self.driven.dt).cumsum(-1)
         travelled = torch.cat([torch.zeros_like(moved[:, :1]), moved], -1)
-        ahead = travelled + signals.gap
+        ahead = travelled + signals["gap"]
         steps = torch.arange(self._kept - 1, device=frames.device)[:, None]
         start = torch.zeros_like(ahead[:, 0])
         segments = Segments(
             leader_position=ahead[:, :-1].T,
-            leader_speed=signals.leader_speed[:, :-1].T,
-            leader_acceleration=signals.leader_acceleration[:, :-1].T,
+            leader_speed=signals["leader_speed"][:, :-1].T,
+            leader_acceleration=signals["leader_acceleration"][:, :-1].T,
             leader_rear=ahead[:, 1:].T,
-            measured_speed=signals.follower_speed[:, 1:].T,
-            measured_gap=signals.gap[:, 1:].T,
+            measured_speed=signals["follower_speed"][:, 1:].T,
+            measured_gap=signals["gap"][:, 1:].T,
             counted=(steps < known - 1).to(frames.dtype),
             leader_length=start,
             position=start,
-            speed=signals.follower_speed[:, 0],
-            acceleration=signals.follower_acceleration[:, 0],
+            speed=signals["follower_speed"][:, 0],
+            acceleration=signals["follower_acceleration"][:, 0],
         )
         return SegmentLosses(self._stepper, self._objective, segments)
 

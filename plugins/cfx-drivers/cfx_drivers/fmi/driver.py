@@ -39,8 +39,7 @@ class CfxDriver(Fmi3Slave):  # type: ignore[misc]  # PythonFMU3 has no types
             f"One step of {self.dt:g} s of a driver that cfx trained: {about['cfx.policy']}"
         )
         self.default_experiment = DefaultExperiment(start_time=0.0, step_size=self.dt)
-        self.register_units([Unit("m", m=1), Unit("m/s", m=1, s=-1), Unit("m/s2", m=1, s=-2)])
-        self.register_units([Unit("s", s=1)])
+        self.register_units(list(_UNITS.values()))
         self.time = 0.0
         self._register("time", "s", "simulated time", Fmi3Causality.independent)
         self.seed = 0
@@ -49,15 +48,16 @@ class CfxDriver(Fmi3Slave):  # type: ignore[misc]  # PythonFMU3 has no types
             kinds: dict[str, Any] = {"tensor(int64)": np.int64, "tensor(float)": np.float32}
             kind = kinds.get(one.type, np.float64)
             self._state[one.name] = np.zeros((1, *one.shape[1:]), kind)
-        self._signals = [name for name, value in self._state.items() if f"unit.{name}" in about]
-        self._signals = [name for name in self._signals if self._state[name].shape == (1,)]
-        self._signals = [name for name in self._signals if about[f"unit.{name}"] != "1"]
+        # What a network does not read is no input of its graph.
+        given = about["cfx.signals"].split()
+        self._signals = [name for name in given if name in self._state]
         for name in self._signals:
             setattr(self, name, _STARTS.get(name, 0.0))
-            self._register(name, about[f"unit.{name}"], _MEANING[name], Fmi3Causality.input)
+            meaning = about[f"meaning.{name}"]
+            self._register(name, about[f"unit.{name}"], meaning, Fmi3Causality.input)
         self.next_speed, self.acceleration = self._now("ego_speed"), 0.0
-        for name, unit in (("next_speed", "m/s"), ("acceleration", "m/s2")):
-            self._register(name, unit, _MEANING[name], Fmi3Causality.output)
+        for name, (unit, meaning) in _OUTPUTS.items():
+            self._register(name, unit, meaning, Fmi3Causality.output)
         self._is_stochastic = "noise" in self._state
         if self._is_stochastic:
             self.register_variable(
@@ -117,7 +117,7 @@ class CfxDriver(Fmi3Slave):  # type: ignore[misc]  # PythonFMU3 has no types
         self.register_variable(
             Float64(
                 name,
-                unit=unit,
+                unit=unit if unit in _UNITS else None,
                 description=meaning,
                 causality=causality,
                 variability=Fmi3Variability.continuous,
@@ -126,12 +126,15 @@ class CfxDriver(Fmi3Slave):  # type: ignore[misc]  # PythonFMU3 has no types
         )
 
 
-_MEANING = {
-    "ego_speed": "speed of the vehicle",
-    "ego_acceleration": "its acceleration over the last step, (v(t) - v(t - dt)) / dt",
-    "leader_speed": "speed of the vehicle ahead",
-    "leader_acceleration": "acceleration of the vehicle ahead",
-    "gap": "to the vehicle ahead, bumper to bumper; infinity: nobody is ahead",
-    "next_speed": "speed of the vehicle one step later",
-    "acceleration": "acceleration of the vehicle until then",
+_UNITS = {
+    "s": Unit("s", s=1),
+    "m": Unit("m", m=1),
+    "m/s": Unit("m/s", m=1, s=-1),
+    "m/s2": Unit("m/s2", m=1, s=-2),
+}
+"""Units that FMI is told of; the description of a variable in another one says what it is."""
+
+_OUTPUTS = {
+    "next_speed": ("m/s", "speed of the vehicle one step later"),
+    "acceleration": ("m/s2", "acceleration of the vehicle until then"),
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from cfx.plugin import Agent, DriverStep, folder_of, load_agent
+from cfx.plugin import Agent, DriverStep, folder_of, load_agent, require_no_further_signals
 
 
 def driver_step(driver: str | Path | Agent) -> DriverStep:
@@ -16,11 +16,14 @@ def driver_step(driver: str | Path | Agent) -> DriverStep:
 
     Raises:
         DataError: there is no policy, or none for unseen drivers.
-        ConfigError: its driving model has equations in a simulator only.
+        ConfigError: its driving model has equations in a simulator only, or an input of the policy
+            reads what these environments do not have.
     """
-    if isinstance(driver, Agent):
-        return DriverStep(driver)
-    folder = folder_of(driver)
-    if not (folder / "policy.json").is_file():
-        folder = folder / "policy"
-    return DriverStep(load_agent(folder))
+    agent = driver
+    if not isinstance(agent, Agent):
+        folder = folder_of(agent)
+        if not (folder / "policy.json").is_file():
+            folder = folder / "policy"
+        agent = load_agent(folder)
+    require_no_further_signals(agent.core.inputs, "this environment")
+    return DriverStep(agent)

@@ -9,8 +9,8 @@ import onnxruntime
 import torch
 from numpy.typing import NDArray
 
-from cfx.plugin import DriverState, DriverStep, Motion
-from cfx_drivers.onnx.graph import SIGNALS, kept_of
+from cfx.plugin import DriverState, DriverStep, Motion, Signal
+from cfx_drivers.onnx.graph import kept_of, signals_of
 
 VEHICLES, STEPS, LENGTH_M = 5, 300, 5.0
 FREE = range(200, 220)
@@ -52,8 +52,10 @@ def largest_difference(step: DriverStep, graph: bytes) -> float:
         ]
         if number in FREE:
             values[-1][0] = math.inf
+        for number_of_signal, signal in enumerate(step.further_signals, 1):
+            values.append(_varying(signal, number + number_of_signal))
         noise = torch.randn((VEHICLES, step.noise_width), generator=generator, dtype=torch.float64)
-        given = dict(zip(SIGNALS, values, strict=True))
+        given = dict(zip(signals_of(step), values, strict=True))
         for name, value in state._asdict().items():
             if name in kept:
                 given[name] = value.numpy()
@@ -69,11 +71,20 @@ def largest_difference(step: DriverStep, graph: bytes) -> float:
     return worst
 
 
+def _varying(signal: Signal, number: int) -> Array:
+    """Returns values of a further signal in its range that change from step to step, `(V,)`."""
+    low, high = max(signal.low, -10.0), min(signal.high, 50.0)
+    phase = 0.1 * number + np.arange(VEHICLES)
+    return np.asarray(low + (high - low) * (0.5 + 0.5 * np.sin(phase)))
+
+
 def _expected(
     step: DriverStep, state: DriverState, values: list[Array], noise: torch.Tensor
 ) -> tuple[Array, DriverState]:
     """Returns cfx's next speeds, and what its drivers remember then."""
-    v, a, v_l, a_l, gap = (torch.from_numpy(value) for value in values)
+    v, a, v_l, a_l, gap, *further = (torch.from_numpy(value) for value in values)
     drawn = noise if step.noise_width else None
-    speed, state = step(state, Motion(v, a), Motion(v_l, a_l), gap, drawn)
+    names = [signal.name for signal in step.further_signals]
+    surroundings = dict(zip(names, further, strict=True))
+    speed, state = step(state, Motion(v, a), Motion(v_l, a_l), gap, drawn, surroundings)
     return speed.numpy(), state

@@ -27,7 +27,10 @@ SIGNALS = {
 NOISE = ("1", "standard normal, new in each step; a driver whose window begins draws of it")
 STATE = {
     "steps": ("1", "steps since the driver began"),
-    "history": ("m/s, m/s2, m", "the signals at the last frames, the leader's first, then the gap"),
+    "history": (
+        "m/s, m/s2, m",
+        "the signals at the last frames: the leader's, the driver's, the gap, then further ones",
+    ),
     "parameters": ("as cfx.parameters says", "parameters that hold in this window"),
     "memory": ("SI", "what the driving model remembers"),
     "network": ("1", "what the network remembers"),
@@ -43,11 +46,12 @@ class _Step(nn.Module):
     def __init__(self, step: DriverStep) -> None:
         super().__init__()
         self.step = step
-        self.network = step.agent.network  # so that its weights are the graph's
+        self.network = step.agent.core.network  # so that its weights are the graph's
         self.kept = kept_of(step)
 
     def forward(self, signals: tuple[Tensor, ...], more: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
-        speed, acceleration, leader_speed, leader_acceleration, gap = signals
+        speed, acceleration, leader_speed, leader_acceleration, gap, *further = signals
+        names = [signal.name for signal in self.step.further_signals]
         given = dict(zip(self.kept, more, strict=False))
         columns = []
         for name in DriverState._fields:
@@ -59,6 +63,7 @@ class _Step(nn.Module):
             Motion(leader_speed, leader_acceleration),
             gap,
             noise,
+            dict(zip(names, further, strict=True)),
         )
         remembered = after._asdict()
         return after_speed, *(remembered[name].clone() for name in self.kept)
@@ -73,6 +78,14 @@ def kept_of(step: DriverStep) -> list[str]:
     return kept
 
 
+def signals_of(step: DriverStep) -> dict[str, tuple[str, str]]:
+    """Returns unit and meaning of each signal that a step is given, by its name in the graph."""
+    signals = dict(SIGNALS)
+    for signal in step.further_signals:
+        signals[signal.name] = (signal.unit or "1", signal.meaning)
+    return signals
+
+
 def graph_of(step: DriverStep, run: str) -> onnx.ModelProto:
     """Returns the graph of a step, for any number of drivers.
 
@@ -85,7 +98,7 @@ def graph_of(step: DriverStep, run: str) -> onnx.ModelProto:
     """
     kept = kept_of(step)
     signals, more = _example(step, kept)
-    inputs = [*SIGNALS, *kept]
+    inputs = [*signals_of(step), *kept]
     if step.noise_width:
         inputs.append("noise")
     drivers = {0: torch.export.Dim("drivers")}
@@ -118,7 +131,7 @@ def graph_of(step: DriverStep, run: str) -> onnx.ModelProto:
 def _example(step: DriverStep, kept: list[str]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
     """Returns inputs of three drivers with which the step is traced, each a tensor of its own."""
     signals = []
-    for number, _ in enumerate(SIGNALS):
+    for number, _ in enumerate(signals_of(step)):
         signals.append(torch.full((3,), 1.0 + number, dtype=torch.float64))
     more = [value for name, value in step.begin(3)._asdict().items() if name in kept]
     if step.noise_width:
@@ -155,12 +168,13 @@ def _strip(model: onnx.ModelProto) -> None:
 
 def _describe(model: onnx.ModelProto, step: DriverStep, run: str) -> None:
     """Writes meanings and units into the graph, and what it is into its metadata."""
-    known = {**SIGNALS, "noise": NOISE, **STATE, "next_speed": NEXT_SPEED}
+    known = {**signals_of(step), "noise": NOISE, **STATE, "next_speed": NEXT_SPEED}
     about = {
         "cfx.version": cfx.__version__,
         "cfx.policy": run,
         "cfx.model": str(step.agent.model_node["name"]),
         "cfx.dt": f"{step.dt:g} s",
+        "cfx.signals": " ".join(signals_of(step)),
         "cfx.parameters": ", ".join(f"{one.name} [{one.unit}]" for one in step.agent.space.tuned),
     }
     for tensor in (*model.graph.input, *model.graph.output):
@@ -168,6 +182,7 @@ def _describe(model: onnx.ModelProto, step: DriverStep, run: str) -> None:
         unit, meaning = known[name if name in known else name.removeprefix("next_")]
         tensor.doc_string = f"{meaning} [{unit}]"
         about[f"unit.{name}"] = unit
+        about[f"meaning.{name}"] = meaning
     onnx.helper.set_model_props(model, about)
     model.doc_string = f"One step of {step.dt:g} s of drivers that cfx trained: {run}"
     model.producer_name, model.producer_version = "cfx", cfx.__version__

@@ -290,7 +290,7 @@ class TrafficProtocol(FoldsOrFinished):
         if context.policy.adapts or not kinds:
             state = _observed(test, test.policy, test.network)
             kinds["policy"] = _Kind(test.policy, state, draws=False)
-            if test.policy.is_stochastic:
+            if test.policy.core.head.is_stochastic:
                 kinds["policy_sampled"] = _Kind(test.policy, state, draws=True)
         return kinds
 

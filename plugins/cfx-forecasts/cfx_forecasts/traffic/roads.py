@@ -18,15 +18,16 @@ import torch
 from torch import Tensor
 
 from cfx.plugin import (
+    OBSERVED,
     Agent,
     AgentState,
     DrivingModel,
     Follower,
-    History,
     Leader,
     MemoryStepper,
     Start,
     composed,
+    require_no_further_signals,
     threads,
 )
 
@@ -341,6 +342,7 @@ def simulate_roads(
         generator: draws, on the CPU, what a stochastic agent leaves to chance; None: nothing is
             drawn.
     """
+    require_no_further_signals(agent.core.inputs, "simulated traffic")
     dt, windows = agent.dt, agent.windows
     stepper = agent.stepper(MemoryStepper(model, dt, compile="never"))
     stepper = stepper.for_model(composed.WithSpeedLimit(stepper.model))
@@ -352,7 +354,9 @@ def simulate_roads(
     outside = torch.zeros_like(min_gap)
     count = max(1, round(seconds / (windows.stride * dt)))
     for _ in range(count):
-        history = History(*(torch.stack(signal, -1) for signal in zip(*seen, strict=True)))
+        history = {}
+        for number, name in enumerate(OBSERVED):
+            history[name] = torch.stack([frame[number] for frame in seen], -1)
         chosen, state = agent.act(history, state, generator)
         outside += state.score > 1.0
         p = agent.space.unpack(chosen)
@@ -378,7 +382,7 @@ def simulate_roads(
 
 
 def _seen(follower: Follower, ahead: Leader) -> tuple[Tensor, ...]:
-    """Returns one frame of what drivers see, in the order of `History`."""
+    """Returns one frame of what drivers see, in the order of `OBSERVED`."""
     gap = ahead.position - ahead.length - follower.position
     return ahead.speed, ahead.acceleration, follower.speed, follower.acceleration, gap
 

@@ -23,6 +23,7 @@ class Roads(ResultTable):
 
     meaning = "simulated roads (`protocol=traffic`)"
     order = 140
+    always_printed = True
     columns = (
         METHOD,
         Column("road", "", "the kind of road", "text"),

@@ -158,7 +158,7 @@ def test_recurrent_policies_drive_each_vehicle_as_the_driver_that_it_is() -> Non
     model = Krauss()
     agent = adaptive(model, cfx.get("policy", "gru")(hidden_size=4), networks=3, features=30)
     with torch.no_grad():
-        for weights in agent.network.parameters():
+        for weights in agent.core.network.parameters():
             weights.add_(torch.randn(weights.shape, generator=drawn()))
     lanes = rings(40.0, vehicles=8)
     start = agent.begin(torch.tensor([0, 1, 2]))

@@ -156,13 +156,13 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
             "rmse_speed": metrics["full_trajectory/rmse_speed/policy"],
             "rmse_speed_pooled": metrics["full_trajectory/rmse_speed/population"],
             "rmse_gap": metrics["full_trajectory/rmse_gap/policy"],
-            "improvement_over_pooled": metrics[f"{improvement}/mean"],
+            "improvement_over_pooled": metrics[f"{improvement}/geometric"],
             "improvement_over_pooled_ci95": [
                 metrics[f"{improvement}/ci95_low"],
                 metrics[f"{improvement}/ci95_high"],
             ],
             "last_part_rmse_speed": metrics["rmse_speed/policy"],
-            "last_part_improvement_over_own": metrics["rmse_improvement/mean"],
+            "last_part_improvement_over_own": metrics["rmse_improvement/geometric"],
         },
         "expected_error": _expected(agent),
         "distributions": _distributions(metrics),
@@ -255,7 +255,7 @@ def _base(agent: Agent) -> dict[str, float]:
     """Returns the driving model's base parameters, without those of a residual."""
     if agent.base is None:
         return {}
-    names = agent.model_space.names
+    names = agent.core.head.model_space.names
     return dict(zip(names, agent.base[0, : len(names)].tolist(), strict=True))
 
 

@@ -113,7 +113,7 @@ def values_of(errors: pd.DataFrame) -> dict[str, tuple[float, float | None, floa
         if metric in COUNTS:
             values[metric] = (float(errors[metric].sum()), None, None)
         else:
-            values[metric] = statistics.mean_interval(errors[metric].tolist(), drivers, seed=0)
+            values[metric] = statistics.mean_interval(errors[metric].tolist(), drivers)
     return values
 
 

@@ -16,7 +16,7 @@ from cfx.plugin import (
     canvas,
     colours,
     identifiability,
-    pair_lines,  # pair_lines
+    pair_lines,
     wording,
 )
 
@@ -250,7 +250,8 @@ def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis
         fixed = float(labels[f"fixed_{axis.name}"].iloc[0])
         place.axhline(fixed, color=colours.colour_of("fixed"), linewidth=1.6)
         place.set_ylabel(
-            wording.unit_label(axis.name, axis.unit).replace(" ", "\n"), fontsize=canvas.points(9)
+            wording.unit_label(axis.name, axis.unit).replace(" ", "\n"),
+            fontsize=canvas.points(9),
         )
         if axis.low is not None and axis.high is not None:
             room = 0.06 * (axis.high - axis.low)

@@ -6,15 +6,7 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from cfx.plugin import (
-    JobFigure,
-    PairTrajectory,
-    Result,
-    canvas,
-    colours,
-    pair_lines,  # pair_lines
-    wording,
-)
+from cfx.plugin import JobFigure, PairTrajectory, Result, canvas, colours, pair_lines, wording
 
 _PAIRS = 3
 

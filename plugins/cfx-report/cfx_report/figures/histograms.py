@@ -9,14 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.plugin import (
-    JobFigure,
-    Result,
-    canvas,
-    colours,
-    parameter_spread,  # parameter_spread
-    wording,
-)
+from cfx.plugin import JobFigure, Result, canvas, colours, parameter_spread, wording
 
 _ACROSS = 5
 _BINS = (6, 30)

@@ -35,9 +35,7 @@ def history_curves(history: pd.DataFrame) -> pd.DataFrame:
             chosen = history[(history["base"] == base) & (history["amount"] == amount)]
             if len(chosen):
                 gains = chosen["improvement"].astype(float).tolist()
-                interval = statistics.mean_interval(
-                    gains, chosen["driver"].astype(str).tolist(), seed=0
-                )
+                interval = statistics.mean_interval(gains, chosen["driver"].astype(str).tolist())
                 rows.append((str(base), amount, *interval, int(np.isfinite(gains).sum())))
     return pd.DataFrame(rows, columns=["base", "amount", "mean", "low", "high", "pairs"])
 

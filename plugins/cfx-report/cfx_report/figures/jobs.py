@@ -16,8 +16,8 @@ from cfx.plugin import (
     Improvement,
     canvas,
     colours,
-    improvement_bars,  # improvement_bars
-    parameter_spread,  # parameter_spread
+    improvement_bars,
+    parameter_spread,
     style,
     wording,
 )
@@ -27,7 +27,7 @@ _WIDE = 1.6
 
 
 _MARKERS = ("o", "s", "D", "P", "X", "*", "h", "p")
-_SHOWN = ("mean", "ci95_low", "ci95_high", "trimmed_mean", "median")
+_SHOWN = ("geometric", "ci95_low", "ci95_high", "ratio_of_means", "median")
 """Statistics of an improvement that are drawn."""
 
 _NAMED = 90
@@ -61,7 +61,7 @@ def statistics_axis(
     values: list[float] = []
     for one in found:
         values += canvas.finite([getattr(one, name) for name in _SHOWN]).tolist()
-    what = "means, medians and ends of intervals"
+    what = "improvements, medians and ends of intervals"
     return improvement_bars.improvement_axis(np.array(values), baseline=baseline, what=what)
 
 
@@ -95,23 +95,23 @@ def error_limit(values: Mapping[str, canvas.Array], unit: str) -> tuple[float, s
 def draw_overview(
     found: Mapping[str, Improvement], baseline: str, axis: improvement_bars.ImprovementAxis
 ) -> Figure:
-    """Draw mean improvement with its 95 % interval, trimmed mean and median: a line per job."""
+    """Draws the improvement with its interval, that of the mean errors, and the median, by job."""
     figure, axes, places = _by_job(list(found))
     colour = colours.colour_of(baseline)
     for (job, row), place in zip(found.items(), places, strict=True):
-        reach = np.nan_to_num([[row.mean - row.ci95_low], [row.ci95_high - row.mean]])
+        centre = row.geometric
+        reach = np.nan_to_num([[centre - row.ci95_low], [row.ci95_high - centre]])
         drawn = axes.errorbar(
-            [row.mean], [place], xerr=reach, color=colour, marker="o", markersize=8, capsize=4
+            [centre], [place], xerr=reach, color=colour, marker="o", markersize=8, capsize=4
         )
         low, high = (
             wording.percent_or_undefined(row.ci95_low, 1),
             wording.percent_or_undefined(row.ci95_high, 1),
         )
-        mean = wording.percent_or_undefined(row.mean, 1)
-        said = f"{job}: mean {mean}, 95 % interval {low} to {high}"
+        said = f"{job}: {wording.percent_or_undefined(centre, 1)}, 95 % interval {low} to {high}"
         canvas.hover(drawn.lines[0], said)
         for name, value, marker in (
-            ("trimmed mean", row.trimmed_mean, "D"),
+            ("of the mean errors", row.ratio_of_means, "D"),
             ("median", row.median, "|"),
         ):
             mark = canvas.draw_points(
@@ -123,8 +123,8 @@ def draw_overview(
     axes.set_xlim(axis.low, axis.high)
     axes.xaxis.set_major_formatter(FuncFormatter(canvas.percent_tick))
     axes.set_xlabel(f"{axis.title} (%)")
-    handles = [_mark("o", colour, "mean and its 95 % interval")]
-    handles += [_mark("D", "black", "trimmed mean"), _mark("|", "black", "median")]
+    handles = [_mark("o", colour, "improvement and its 95 % interval")]
+    handles += [_mark("D", "black", "of the mean errors"), _mark("|", "black", "median")]
     canvas.legend_above(figure, handles)
     return figure
 

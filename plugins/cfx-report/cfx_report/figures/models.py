@@ -22,8 +22,8 @@ def draw_models(
     """Draws a panel per other job: a dot per pair; above the line the best job is closer.
 
     Args:
-        errors: as `cfx.evaluation.statistics.against_the_best` takes them.
-        compared: as it returns them; at least one.
+        errors: as `cfx.evaluation.statistics.ranking_of` takes them.
+        compared: as it returns them in `against`; at least one.
     """
     shown = compared[:_MOST]
     across = min(canvas.most_across(_ACROSS), len(shown))
@@ -42,9 +42,11 @@ def draw_models(
         axes.set_xlim(0, end)
         axes.set_ylim(0, end)
         axes.set_aspect("equal")
-        lead = f"{wording.percent(one.found.mean, 1)} (p = {one.p_value:.2g})"
-        if headline.opposite(one.found.mean, one.of_means):
-            lead += f"; of the means {wording.percent(one.of_means, 1)}"
+        improvement = one.improvement
+        lead = f"{wording.percent(improvement.geometric, 1)} (p = {one.p_value:.2g})"
+        note = headline.summaries_disagree(improvement.geometric, improvement.ratio_of_means)
+        if note:
+            lead += f"; {note}"
         axes.set_title(f"{one.best} over {one.other}\n{lead}")
         axes.set_xlabel(canvas.wrapped(f"RMSE of speed of {one.best} (m/s)"))
         axes.set_ylabel(canvas.wrapped(f"RMSE of speed of {one.other} (m/s)"))

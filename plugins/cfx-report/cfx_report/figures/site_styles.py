@@ -91,7 +91,12 @@ def _panel(axes: Axes, values: canvas.Array, shown: Sequence[style.Group], title
         low, middle, high = np.quantile(mine, [0.25, 0.5, 0.75])
         axes.plot([low, high], [place, place], color=colour, linewidth=canvas.points(2.2))
         (mark,) = axes.plot(
-            middle, place, "o", color=colour, markeredgecolor="white", markersize=canvas.points(6)
+            middle,
+            place,
+            "o",
+            color=colour,
+            markeredgecolor="white",
+            markersize=canvas.points(6),
         )
         canvas.hover(mark, f"{_called(group)}: median {middle:.3g}, {len(mine)} drivers")
     axes.set_yticks(range(len(shown)), [_called(group) for group in shown])

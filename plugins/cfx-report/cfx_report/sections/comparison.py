@@ -240,7 +240,7 @@ def _gain(job: Result, baseline: str, scope: str) -> Cell:
         digits = 0 if max(abs(low), abs(high)) >= 1 else 1
         ends = (wording.percent(low, digits), wording.percent(high, digits))
         second = " to ".join(end.removesuffix(" %") for end in ends)
-    return number(job.statistics(baseline, scope).mean, "+.1%", second)
+    return number(job.statistics(baseline, scope).geometric, "+.1%", second)
 
 
 def _with_baseline(job: Result, metric: str, scope: str, baseline: str, form: str) -> Cell:
@@ -324,7 +324,7 @@ def _error_over_seeds(row: Row, method: str) -> Cell:
 
 
 def _gain_over_seeds(row: Row, baseline: str) -> Cell:
-    return _mean_and_range(row.improvements("mean", baseline), "+.1%")
+    return _mean_and_range(row.improvements("geometric", baseline), "+.1%")
 
 
 def _mean_and_range(values: np.ndarray, form: str) -> Cell:

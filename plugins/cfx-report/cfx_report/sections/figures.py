@@ -171,8 +171,7 @@ _AMOUNTS: tuple[Column[dict[str, Any]], ...] = (
     Column(
         "95 % interval",
         lambda row: interval(row["low"], row["high"]),
-        "Bootstrap confidence interval of the mean; drivers are resampled, each with all their"
-        " pairs.",
+        "Confidence interval of the mean, over drivers with all their pairs.",
     ),
     Column("Pairs", lambda row: number(row["pairs"], "d"), "Pairs whose improvement is defined."),
 )

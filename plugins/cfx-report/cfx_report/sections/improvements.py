@@ -11,22 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from cfx.plugin import (
-    Improvement,
-    Purpose,
-    Result,
-    improvement_bars,  # improvement_bars
-    job_folder,
-    style,
-    wording,
-)
+from cfx.plugin import Improvement, Purpose, Result, improvement_bars, job_folder, style, wording
 from cfx_report.figures.jobs import ClusterGroup, draw_clusters, draw_every_pair
 from cfx_report.jobs import Runs, any_baselines, of_purpose
 from cfx_report.names import SEPARATOR, differences
 from cfx_report.section import Cell, Column, Section, Sheet, View, formatted, number
 from cfx_report.sections.results import STATISTICS
 
-_STATISTICS = ("mean", "ci95_low", "ci95_high")
+_STATISTICS = ("geometric", "ci95_low", "ci95_high")
 
 Pair = Mapping[str, Any]
 """A row of `Result.by_pair`."""
@@ -264,6 +256,4 @@ def improvement_of(table: pd.DataFrame, baseline: str) -> Improvement:
 
     before = table[f"rmse_speed/{baseline}"].to_numpy(dtype=float)
     after = table["rmse_speed/policy"].to_numpy(dtype=float)
-    return statistics.improvement_statistics(
-        before, after, table["driver"].astype(str).tolist(), seed=0
-    )
+    return statistics.improvement_statistics(before, after, table["driver"].astype(str).tolist())

@@ -92,7 +92,7 @@ def value_of(job: Result, path: str) -> Any:
         "component": job.component,
         "setting": job.setting,
         "metric": lambda *parts: job.metrics.get("/".join(parts), math.nan),
-        "improvement": job.improvement,
+        "improvement": lambda name, over: getattr(job.statistics(over), name),
         "source": lambda: job_folder.without_folders(str(job.data.get("source", ""))),
         "pairs": job.pairs["pair_id"].nunique,
         "pair": lambda: _pair(job),
@@ -114,7 +114,7 @@ def verdicts(about: Mapping[str, Any], jobs: Sequence[Result]) -> list[str]:
     if about["judged"]:
         gains = {job.name: float(value_of(job, about["judged"])) for job in jobs}
         for name, gain in gains.items():
-            said.append(f"{name}: mean improvement {wording.percent_or_undefined(gain, 1)}.")
+            said.append(f"{name}: mean of the ratios {wording.percent_or_undefined(gain, 1)}.")
         known = [gain for gain in gains.values() if math.isfinite(gain)]
         if len(known) > 1:
             above = sum(gain > 0 for gain in known)

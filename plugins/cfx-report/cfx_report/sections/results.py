@@ -221,27 +221,27 @@ def _p_value(row: Any) -> Cell:
 
 STATISTICS: tuple[Column[Any], ...] = (
     Column(
-        "Mean",
-        lambda row: number(row.found.mean, "+.1%"),
-        f"Improvement of a pair: (RMSE of the baseline {wording.MINUS} RMSE of the policy) / RMSE"
-        " of the baseline, RMSE of the speed over these frames. Above 0 the policy is closer to the"
-        " real driver. Here the mean over the pairs.",
+        "Improvement",
+        lambda row: number(row.found.geometric, "+.1%"),
+        f"1 {wording.MINUS} the geometric mean over drivers of RMSE of the policy / RMSE of the"
+        " baseline, RMSE of the speed over these frames. Above 0 the policy is closer to the real"
+        " driver.",
     ),
     Column(
         "95 % interval",
         lambda row: interval(row.found.ci95_low, row.found.ci95_high),
-        "Bootstrap confidence interval of that mean; drivers are resampled, each with all their"
-        " pairs.",
+        "Student's t interval of the drivers' logarithms of that ratio.",
     ),
     Column(
-        "Trimmed mean",
-        lambda row: number(row.found.trimmed_mean, "+.1%"),
-        "Mean without the top and the bottom tenth of the pairs, as the paper averages.",
+        "Of the mean errors",
+        lambda row: number(row.found.ratio_of_means, "+.1%"),
+        f"1 {wording.MINUS} mean RMSE of the policy / mean RMSE of the baseline: pairs with large"
+        " errors weigh most.",
     ),
     Column(
         "Median",
         lambda row: number(row.found.median, "+.1%"),
-        "Half of the pairs improve more.",
+        "Half of the drivers improve more.",
     ),
     Column(
         "Better for",
@@ -251,13 +251,18 @@ STATISTICS: tuple[Column[Any], ...] = (
     Column(
         "p",
         _p_value,
-        "Two-sided Wilcoxon signed-rank test of the baseline's RMSE against the policy's, means"
-        " over each driver's pairs.",
+        "Two-sided t test of the drivers' logarithms of the ratio: below 0.05 where the interval"
+        " excludes 0.",
     ),
     Column(
         "Pairs",
         lambda row: number(row.found.pairs, "d"),
-        "Pairs that count. One does not if the baseline has no error or a simulation diverges.",
+        "Pairs that count. One does not if a method has no error or a simulation diverges.",
+    ),
+    Column(
+        "Drivers",
+        lambda row: number(row.found.drivers, "d"),
+        "Drivers of these pairs.",
     ),
 )
 """Of rows with an `Improvement`, `found`."""

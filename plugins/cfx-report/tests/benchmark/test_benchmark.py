@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy import stats
 
 import cfx
 from cfx.app.cli import main
@@ -106,8 +107,9 @@ def test_a_row_has_means_with_intervals_over_drivers_and_sums_of_counts(tmp_path
     assert mean == pytest.approx(np.mean(SPEED))
     assert low is not None
     assert high is not None
-    # Two drivers with two pairs each: the bootstrap's means lie between theirs.
-    assert 0.55 <= low <= mean <= high <= 0.8
+    # Two drivers with two pairs each, 0.55 and 0.8 m/s: Student's t with one degree of freedom.
+    margin = stats.t.ppf(0.975, 1) * 0.125
+    assert (low, high) == pytest.approx((mean - margin, mean + margin))
     assert values["collisions"] == (6.0, None, None)
 
 
@@ -147,12 +149,12 @@ def test_a_comparison_is_pair_by_pair(tmp_path: Path) -> None:
     found = compared(mine, theirs.sample(frac=1.0, random_state=1), "other.csv")
     assert set(found) == {("other", "rmse_speed"), ("other", "rmse_gap")}
     one = found["other", "rmse_speed"]
-    assert one.mean == pytest.approx(0.5)
+    assert one.geometric == pytest.approx(0.5)
     assert one.ci95_low == pytest.approx(0.5)
     assert one.win_rate == 1.0
     assert "| other | rmse_speed | +50.0% |" in "\n".join(lines_of(found))
     same = compared(mine, mine, "me")["mine", "rmse_gap"]
-    assert (same.mean, same.p_value) == (0.0, 1.0)
+    assert (same.geometric, same.p_value) == (0.0, 1.0)
 
 
 def test_what_does_not_compare_is_refused(tmp_path: Path) -> None:

@@ -27,7 +27,14 @@ def test_a_finished_job_is_published_without_training(
     published = READY_FOLDER / name
     agent = load_agent(published / "policy")
     save_agent(agent, job / "policy")
-    (job / "metrics.json").write_text((published / "metrics.json").read_text())
+    metrics = json.loads((published / "metrics.json").read_text())
+    on_card = card_of(name)["errors_on_unseen_drivers"]
+    low, high = on_card["improvement_over_pooled_ci95"]
+    pooled = "full_trajectory/rmse_improvement/population"
+    metrics |= {f"{pooled}/ci95_low": low, f"{pooled}/ci95_high": high}
+    metrics[f"{pooled}/geometric"] = on_card["improvement_over_pooled"]
+    metrics["rmse_improvement/geometric"] = on_card["last_part_improvement_over_own"]
+    (job / "metrics.json").write_text(json.dumps(metrics))
     (job / "data.json").write_text(json.dumps({"fingerprint": "abc"}))
     monkeypatch.setattr(publish, "READY_FOLDER", folder)
     stress = card_of(name)["stress"]

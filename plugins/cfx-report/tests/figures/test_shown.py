@@ -94,7 +94,7 @@ def test_improvements_are_cut_off_at_one_place() -> None:
     values = np.array([0.3, 0.25, 0.2, 0.1, np.nan, -0.1, -0.2, -7.0, 0.15, 0.05])
     ids = [f"p{k}" for k in range(10)]
     summary = make_results(pairs=3).evaluation.improvements["test"]["fixed"]
-    bars = improvement_bars(["job"], [ids], [values], marks=(summary.mean,))
+    bars = improvement_bars(["job"], [ids], [values], marks=(summary.geometric,))
     (series,) = bars.series
     for figure in (draw_improvements(bars, summary), draw_every_pair(bars, series.pair_ids)):
         heights = [patch.get_height() for patch in figure.axes[0].patches if patch.get_width() < 1]

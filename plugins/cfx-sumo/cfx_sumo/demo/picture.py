@@ -11,15 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Patch
 from matplotlib.transforms import Affine2D
 
-from cfx.plugin import (
-    Evaluation,
-    Result,
-    canvas,
-    colours,
-    drawing,
-    pair_lines,  # pair_lines
-    wording,
-)
+from cfx.plugin import Evaluation, Result, canvas, colours, drawing, pair_lines, wording
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
 from cfx_sumo.demo.simulated import Array, SimulatedPair

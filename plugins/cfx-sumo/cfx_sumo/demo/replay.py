@@ -181,7 +181,7 @@ def _scene(
         for kind in FOLLOWERS:
             roads.append(Road(number, kind, pair, arrays))
         frames = len(arrays[f"{number}/leader"][0])
-        chosen[number] = np.full((frames, len(policy.policy.model_space)), np.nan)
+        chosen[number] = np.full((frames, len(policy.policy.core.head.model_space)), np.nan)
         policy.assign(
             f"{number}/policy",
             pair["network"],

@@ -24,7 +24,8 @@ from cfx.plugin import (
     PairBatch,
     PairSet,
     PairTrajectory,
-    pair_lines,  # pair_lines
+    driver_features_of,
+    pair_lines,
     worker_pool,
 )
 from cfx_sumo.demo.motorway import ABREAST, Motorway
@@ -257,10 +258,10 @@ def _driver_features(job: FinishedJob, pair: Pair, first: int) -> dict[str, floa
     until = torch.tensor([first])
     since = torch.tensor([job.knowledge.since(first, job.policy.dt)])
     batch = PairBatch.of(PairSet((pair,), pair.recording))
-    features = job.policy.driver_features_of(batch, until, since)
+    features = driver_features_of(job.policy, batch, until, since)
     if features is None or bool(features.isnan().any()):
         return None
-    return dict(zip(job.policy.policy.driver_features, features[0].tolist(), strict=True))
+    return dict(zip(job.policy.core.driver_features, features[0].tolist(), strict=True))
 
 
 def _renewed(job: FinishedJob, first: int) -> int:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from cfx.errors import DataError, ParameterError
-from cfx.plugin import ANY_DRIVER, Agent
+from cfx.plugin import ANY_DRIVER, Agent, base_of
 from cfx_sumo.live.vehicles import VehicleTable
 
 
@@ -130,13 +130,13 @@ class Assignments:
         return number
 
     def _shrunk_base(self, base: Mapping[str, float]) -> list[float]:
-        names = self._policy.model_space.names
+        names = self._policy.core.head.model_space.names
         if set(base) != set(names):
             raise ParameterError(
                 f"base: give a value for each of {', '.join(names)}, and nothing else"
             )
         calibrated = torch.tensor([[base[name] for name in names]], dtype=torch.float64)
-        shrunk: list[float] = self._policy.base_of(calibrated)[0].tolist()
+        shrunk: list[float] = base_of(self._policy, calibrated)[0].tolist()
         return shrunk
 
     def _ordered_features(self, driver_features: Mapping[str, float]) -> list[float]:

@@ -22,7 +22,14 @@ import torch
 from torch import Tensor
 
 from cfx.errors import DataError, SumoError
-from cfx.plugin import ANY_DRIVER, Agent, DrivingModel, registry, threads
+from cfx.plugin import (
+    ANY_DRIVER,
+    Agent,
+    DrivingModel,
+    registry,
+    require_no_further_signals,
+    threads,
+)
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.control import VehicleControl
@@ -136,7 +143,9 @@ class Driver:
         Raises:
             DataError: `look_ahead` is no distance; the policy has no such network; or its driving
                 model has equations in SUMO only, or may brake harder than a vehicle can.
+            ConfigError: an input of the policy reads what SUMO does not give.
         """
+        require_no_further_signals(policy.core.inputs, "SUMO")
         if not look_ahead > 0:
             raise DataError(
                 f"look_ahead={look_ahead:g}: give a distance above 0 m within which a leader counts"
@@ -148,7 +157,7 @@ class Driver:
         check_model(self.model, policy.model_node["name"], source)
         self.counts = DriveCounts()
         self._assignments = Assignments(policy, network, source)
-        self._vehicles = KnownVehicles(policy, policy.head.driven_model(self.model))
+        self._vehicles = KnownVehicles(policy, policy.core.head.driven_model(self.model))
         self._histories = Histories(self._vehicles)
         self._windows = PolicyWindows(policy, self._vehicles, self._assignments, seed)
         self._model_steps = ModelSteps(
@@ -239,8 +248,9 @@ class Driver:
                     themselves
                 ignore it.
             driver_features: name -> value, where the policy was trained to read some
-                (`policy.driver_features`; `Agent.driver_features_of` measures them); None: those of
-                an unseen driver. What a vehicle does while it is watched does not change them.
+                (`policy.driver_features`; `cfx.plugin.driver_features_of` measures them); None:
+                those of an unseen driver. What a vehicle does while it is watched does not change
+                them.
 
         Raises:
             DataError: the policy has no such network.
@@ -358,10 +368,7 @@ class Driver:
 
     def _hold(self, connection: Connection, names: list[str], now: float, clock: Clock) -> None:
         """Lets vehicles go on as they accelerate, in the steps between two of the model."""
-        driven = []
-        for name in names:
-            if self.drives(name):
-                driven.append(name)
+        driven = [name for name in names if self.drives(name)]
         if not driven:
             return
         table, rows = self._vehicles.table, self._vehicles.rows(driven)

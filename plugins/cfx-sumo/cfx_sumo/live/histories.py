@@ -8,12 +8,12 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.plugin import History
+from cfx.plugin import OBSERVED
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.surroundings import Seen, View
 from cfx_sumo.live.vehicles import KnownVehicles
 
-_LEADER_SPEED, _LEADER_ACCELERATION, _SPEED, _ACCELERATION, _GAP = range(len(History._fields))
+_LEADER_SPEED, _LEADER_ACCELERATION, _SPEED, _ACCELERATION, _GAP = range(len(OBSERVED))
 """Rows of a history."""
 
 _WALKING_MPS = 1.5
@@ -21,11 +21,15 @@ _WALKING_MPS = 1.5
 
 
 def frame_of(seen: Seen) -> Tensor:
-    """Returns one frame of a history, `(D, 5)`."""
-    history = History(
-        seen.leader_speed, seen.leader_acceleration, seen.speed, seen.acceleration, seen.gap
+    """Returns one frame of a history, `(D, 5)`, in the order of `OBSERVED`."""
+    signals = (
+        seen.leader_speed,
+        seen.leader_acceleration,
+        seen.speed,
+        seen.acceleration,
+        seen.gap,
     )
-    return torch.stack(list(history), 1)
+    return torch.stack(signals, 1)
 
 
 class Histories:
@@ -118,7 +122,7 @@ class Histories:
         error = frame - table.expected[rows]
         error[:, _ACCELERATION] = error[:, _SPEED] / clock.dt
         error[:, _LEADER_ACCELERATION] = error[:, _LEADER_SPEED] / clock.dt
-        of_follower = torch.zeros(len(History._fields), dtype=torch.bool)
+        of_follower = torch.zeros(len(OBSERVED), dtype=torch.bool)
         of_follower[[_SPEED, _ACCELERATION]] = True
         used = going[:, None] & (of_follower | leader_stays[:, None])
         error = torch.where(used, error, 0.0)

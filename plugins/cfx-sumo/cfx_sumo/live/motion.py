@@ -36,7 +36,7 @@ class ModelSteps:
         self, policy: Agent, model: DrivingModel, vehicles: KnownVehicles, *, bounds_braking: bool
     ) -> None:
         self._space = policy.space
-        self._driven = policy.head.driven_model(model)
+        self._driven = policy.core.head.driven_model(model)
         self._model = model
         self._vehicles = vehicles
         self._bounds_braking = bounds_braking

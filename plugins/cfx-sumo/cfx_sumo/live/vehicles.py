@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from cfx.plugin import Agent, DrivingModel, History
+from cfx.plugin import OBSERVED, Agent, DrivingModel
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class VehicleTable:
     """A row per vehicle; double precision where nothing else is said.
 
     Attributes:
-        history: `(C, 5, L)`, the signals of `History`.
+        history: `(C, 5, L)`, the signals `OBSERVED`.
         parameters: `(C, n)`, SI units.
         memory: `(C, m)`, of the model.
         state: `(C, s)`, of the networks, in their precision.
@@ -67,7 +67,7 @@ class VehicleTable:
         length, parameters = agent.windows.length, len(agent.space)
         features = len(agent.core.driver_features)
         return cls(
-            history=_unknown(count, len(History._fields), length),
+            history=_unknown(count, len(OBSERVED), length),
             parameters=_unknown(count, parameters),
             memory=torch.zeros((count, model.memory_size), dtype=torch.float64),
             state=state.new_zeros((count, state.shape[-1])),
@@ -84,7 +84,7 @@ class VehicleTable:
             start=_unknown(count),
             ramp=_unknown(count),
             told=_unknown(count),
-            expected=_unknown(count, len(History._fields)),
+            expected=_unknown(count, len(OBSERVED)),
         )
 
     def columns_of(self, rows: Tensor) -> dict[str, Tensor]:

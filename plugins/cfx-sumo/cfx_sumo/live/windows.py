@@ -8,7 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.plugin import Agent, AgentState, DriverContext, History
+from cfx.plugin import OBSERVED, Agent, AgentState, DriverContext, History
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.draws import standard_normal
@@ -35,7 +35,7 @@ class PolicyWindows:
         self._policy = policy
         self._vehicles = vehicles
         self._assignments = assignments
-        self._seed = seed if policy.is_stochastic else None
+        self._seed = seed if policy.core.head.is_stochastic else None
 
     def begin(self, rows: Tensor, names: list[str]) -> None:
         """Begins vehicles behind a leader anew, with what is known of them from elsewhere.
@@ -93,7 +93,7 @@ class PolicyWindows:
             noise = None
             if self._seed is not None:
                 drawn = [names[number] for number in block.tolist()]
-                noise = standard_normal(self._seed, drawn, now, self._policy.head.noise_width)
+                noise = standard_normal(self._seed, drawn, now, self._policy.core.head.noise_width)
             self._choose_together(rows[block], noise)
 
     def observe(self, rows: Tensor, clock: Clock) -> None:
@@ -145,4 +145,4 @@ class PolicyWindows:
             state = begun.state.clone()
             state[begun.network, begun.place] = last
         now = begun._replace(state=state, latent=table.latent[rows])
-        return History(*table.history[rows].unbind(1)), now
+        return dict(zip(OBSERVED, table.history[rows].unbind(1), strict=True)), now

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cfx.data.pairs import SIGNALS, Dropped, Pair, PairSet
-from cfx.data.signals import resampled
+from cfx.data.pairs import Dropped, Pair, PairSet
+from cfx.data.resampling import resampled
+from cfx.data.signals import RECORDED
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.errors import ConfigError
 
@@ -43,7 +44,7 @@ def test_drives_stay_what_they_are(recorded: float, wanted: float) -> None:
     expected = swinging(len(pair), wanted)
     assert pair.dt == wanted
     assert (len(pair) - 1) * wanted == pytest.approx(999 * recorded, abs=wanted)
-    for name in SIGNALS:
+    for name in RECORDED:
         # A monotone cubic flattens a peak: by half its curvature times the square of half a step at
         # most, and little elsewhere.
         np.testing.assert_allclose(
@@ -58,7 +59,7 @@ def test_frames_that_both_steps_share_are_the_recorded_ones() -> None:
     pair = swinging(100, 0.05)
     (coarse,) = resampled(of(pair), 0.1)
     assert len(coarse) == 50
-    for name in SIGNALS:
+    for name in RECORDED:
         np.testing.assert_allclose(getattr(coarse, name), getattr(pair, name)[::2], rtol=1e-12)
 
 
