@@ -87,3 +87,30 @@ def test_usual_test_parts_are_not_warned_of(caplog: pytest.LogCaptureFixture) ->
     pairs, split = split_of(300, 0.8)
     split.check_test_parts(pairs, WindowSettings(), 0.8)
     assert not caplog.messages
+
+
+@pytest.mark.parametrize(("last", "said"), [(69, None), (70, "4.9 s of the median pair")])
+def test_short_test_parts_are_warned_of(
+    last: int, said: str | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A test part of 5 s is long enough; one frame less is within the transient."""
+    pairs = straight_pairs([120])
+    split = Split(torch.tensor([last]), torch.tensor([10]))
+    split.check_test_parts(pairs, WindowSettings(), 0.6)
+    if said is None:
+        assert not caplog.messages
+    else:
+        assert said in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("last", "share", "said"),
+    [
+        (119, 1.0, "split=1 leaves nothing to be tested"),
+        (114, 0.95, "no more than one window, in which nothing adapts"),
+    ],
+)
+def test_without_a_test_part_nothing_can_be_tested(last: int, share: float, said: str) -> None:
+    split = Split(torch.tensor([last]), torch.tensor([10]))
+    with pytest.raises(DataError, match=said):
+        split.check_test_parts(straight_pairs([120]), WindowSettings(), share)
