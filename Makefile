@@ -6,6 +6,7 @@
 #   make golden | make golden-write           compare the results of small jobs, bit for bit, with recorded ones | record them anew
 #   make settings [EVERY=20]                  each setting of each option changes what a job writes, or is refused (every 20th alone)
 #   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
+#   make mutants [MUTANTS=300 SEED=0 ROOMS="calibration simulation"]   change the code at random; what no test of its room notices
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
 #   make policies                             train the ready-made policies anew from ../shared/data (two hours)
 #   make dist                                 build cfx and the plugins into dist/, install cfx alone into a clean environment, then all, try both
@@ -28,7 +29,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow golden golden-write settings fuzz kills bench policies docs tutorials dist beside conf lock clean
+.PHONY: run test test-slow golden golden-write settings fuzz mutants kills bench policies docs tutorials dist beside conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -50,6 +51,11 @@ settings: $(VENV)/.ready-test
 
 fuzz: $(VENV)/.ready-test
 	CFX_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) CFX_FAULTS_STRIDE=1 $(BIN)/python -m pytest tests/fuzz --timeout 0 -n auto
+
+# Goes on where it was interrupted; a mutant takes as long as its room's tests at most, three times as long where it hangs.
+mutants: $(VENV)/.ready-test
+	$(PIP) install --quiet --constraint constraints.txt --editable '.[mutants]'
+	$(BIN)/python -m tests.mutants --count $(or $(MUTANTS),300) --seed $(or $(SEED),0) $(if $(ROOMS),--rooms $(ROOMS))
 
 kills: $(VENV)/.ready-test
 	CFX_KILLS=$(or $(KILLS),100) $(BIN)/python -m pytest -m slow tests/fuzz/test_kills.py -s
@@ -137,12 +143,12 @@ lock:
 	rm -rf .venv-lock
 	$(PYTHON) -m venv .venv-lock
 	$(MAKE) VENV=.venv-lock .venv-lock/.torch
-	.venv-lock/bin/python -m pip install --quiet --upgrade --editable '.[test,docs,dist]'
+	.venv-lock/bin/python -m pip install --quiet --upgrade --editable '.[test,docs,dist,mutants]'
 	{ echo "# Versions that were tested together; make lock writes this file. pip install --constraint constraints.txt ..."; \
 	  .venv-lock/bin/python -m pip freeze --exclude-editable | sed 's/+cpu$$//'; } > constraints.new
 	mv constraints.new constraints.txt
 	rm -rf .venv-lock
 
 clean:
-	rm -rf $(VENV) .venv-lock .venv-dist .venv-beside .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
+	rm -rf $(VENV) .venv-lock .venv-dist .venv-beside .mutants .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

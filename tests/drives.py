@@ -98,7 +98,7 @@ def wavy_pairs(
 
 
 def simulate_from_origins(
-    simulator: Stepper,
+    stepper: Stepper,
     agent: Agent,
     followers: Followers,
     origins: Origins,
@@ -107,5 +107,5 @@ def simulate_from_origins(
     leader: LeaderFuture = "given",
 ) -> Paths:
     """Simulates followers from origins on, where nothing is drawn."""
-    found = sample_from_origins(simulator, agent, followers, origins, steps, leader=leader)
+    found = sample_from_origins(stepper, agent, followers, origins, steps, leader=leader)
     return Paths(found.speed[0], found.travelled[0])

@@ -312,7 +312,7 @@ def test_the_guide_names_what_the_door_has() -> None:
     assert set(re.findall(r"\bcfx\.[a-z]+\b", text)) <= groups | doors
 
 
-def test_the_table_of_parts_names_what_is_there() -> None:
+def test_the_table_of_simple_kinds_names_what_is_there() -> None:
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\w+) \| `(cfx\.\w+)` \| `([\w.]+)` \|", text, flags=re.MULTILINE)
     kinds = registry.every_kind()

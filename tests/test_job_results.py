@@ -165,7 +165,7 @@ def test_platoon_and_history_are_written_and_old_ones_go(tmp_path: Path, present
             evaluation, platoon=make_platoon({"policy": 1}), tables={"history": history}
         )
     tables, _ = tables_of(evaluation, installed(), tmp_path)
-    written = {file_of(table): table.part for table in installed() if table.name in tables}
+    written = {file_of(table): table.component for table in installed() if table.name in tables}
     further = {file for file, table in written.items() if not table.always}
     assert further == {"pair_metrics.parquet", *(names if present else ())}
     assert {path.name for path in tmp_path.iterdir()} == set(written)

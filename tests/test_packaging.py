@@ -38,7 +38,7 @@ def test_entry_points_of_pyproject_are_the_installed_ones() -> None:
     declared = {
         group: set(points.items()) for group, points in PYPROJECT["project"]["entry-points"].items()
     }
-    for kind in (*registry.KINDS.values(), *registry.PARTS.values()):
+    for kind in (*registry.KINDS.values(), *registry.SIMPLE_KINDS.values()):
         installed = {
             (one.name, one.target) for one in registry.entries(kind.name) if one.distribution == OWN
         }

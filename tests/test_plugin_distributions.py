@@ -206,6 +206,8 @@ def test_templates_examples_and_documents_use_the_doors_alone(tmp_path: Path) ->
         wrong += beside_the_doors(path)
     pages = [ROOT / "README.md", *ROOT.glob("docs/**/*.md"), *ROOT.glob("plugins/*/README.md")]
     for page in pages:
+        if page.parent == ROOT / "docs" / "development":
+            continue  # for those who change cfx
         for number, block in enumerate(blocks(page.relative_to(ROOT).as_posix(), "python")):
             path = tmp_path / f"{page.parent.name} {page.stem} {number}"
             path.write_text(block, encoding="utf-8")

@@ -102,7 +102,7 @@ def test_a_cache_behind_a_url_keeps_entries_whole(bucket: str) -> None:
     assert found is not None
     for name, values in arrays.items():
         assert np.array_equal(found[name], values)
-    shares = cache.shares([KEY, "cd" * 32], "labels")
+    shares = cache.shards([KEY, "cd" * 32], "labels")
     with cache.claim(dict.fromkeys(shares, 2), 10) as claimed:
         assert claimed == list(shares)
 

@@ -150,7 +150,7 @@ def train(
         >>> sorted(result.pairs["method"].unique())
         ['default', 'fixed', 'policy', 'population']
         >>> result.improvement(over="population").index[0]
-        'mean'
+        'geometric'
     """
     return config(pairs_from(pairs), experiment=for_, model=model, seed=seed, **settings).run()
 

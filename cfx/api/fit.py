@@ -210,8 +210,8 @@ class Fit:
         first = self._last.to(batch.lengths.device)
         train = training_errors(context.calibrator, batch, first, parameters)
         errors = {
-            "pair_id": [pair.pair_id for pair in context.pairs],
-            "driver": [pair.driver for pair in context.pairs],
+            "pair_id": context.pairs.ids,
+            "driver": context.pairs.drivers,
             "method": method,
             "train_rmse_speed": train["rmse_speed"].cpu().numpy(),
             "train_rmse_gap": train["rmse_gap"].cpu().numpy(),
@@ -220,7 +220,7 @@ class Fit:
             agent = context.constant(FixedPolicy(), parameters)
             each = torch.arange(len(batch), device=batch.lengths.device)
             loop = simulate_in_shards(
-                context.engine, context.simulator, agent, Followers(batch, each), first
+                context.engine, context.stepper, agent, Followers(batch, each), first
             )
             speed, gap = closed_loop_errors(batch, first, loop)
             errors |= {"test_rmse_speed": speed, "test_rmse_gap": gap}
@@ -291,10 +291,10 @@ def calibrate(
         from cfx.app.job import steps
         from cfx.simulation.windows import Split
 
-        _, parts, context = steps.without_files(experiment.config, recording.selected)
-        with closing(parts.engine):
+        _, components, context = steps.without_files(experiment.config, recording.selected)
+        with closing(components.engine):
             last = Split.of(context.pairs, context.windows, context.split).frame
             found = context.calibrator.fixed(context.pairs, context.batch, last)
-    ids = pd.Index([pair.pair_id for pair in context.pairs], name="pair_id")
+    ids = pd.Index(context.pairs.ids, name="pair_id")
     table = pd.DataFrame(found.cpu().numpy(), ids, list(context.space.names))
     return Fit(experiment, recording, table, context, last)

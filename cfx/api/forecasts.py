@@ -128,8 +128,8 @@ def forecast(
         recording = pairs_from(pairs)
         chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
         experiment = config(recording, **chosen)
-        _, parts, context = steps.without_files(experiment.config, recording.selected)
-        finished = cast(Any, parts.protocol).finished
+        _, components, context = steps.without_files(experiment.config, recording.selected)
+        finished = cast(Any, components.protocol).finished
         finished.check(context.pairs)
         agent: Agent = finished.agent.to(context.batch.lengths.device)
         if samples and not agent.core.head.is_stochastic:
@@ -153,7 +153,7 @@ def forecast(
         network = torch.zeros_like(origins.pair)
         followers = Followers(context.batch, network, base, agent.context_rule.history_s)
         found = sample_from_origins(
-            context.simulator,
+            context.stepper,
             agent,
             followers,
             origins,
@@ -198,7 +198,7 @@ def _tables(
     is_recorded = recorded.cpu().numpy().ravel()
     dt = context.batch.dt
     time = (int(origins.frame[0]) + np.arange(steps + 1)) * dt
-    ids = [pair.pair_id for pair in context.pairs]
+    ids = context.pairs.ids
     paths = []
     for number in range(len(found.speed)):
         table = _long(ids, time, found.speed[number], found.travelled[number])

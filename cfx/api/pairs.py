@@ -127,7 +127,7 @@ class Pairs:
         Raises:
             DataError: there is no pair of such an id, or one is named twice.
         """
-        known = [pair.pair_id for pair in self.selected]
+        known = self.selected.ids
         chosen_ids = chosen_names(pair_ids, known, self.selected.source)
         keep = [name in chosen_ids for name in known]
         chosen = self.selected.select(keep, "not selected")

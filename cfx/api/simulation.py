@@ -119,7 +119,7 @@ def simulate(
                 f"at={at:g}: the shortest pair has {int(batch.lengths.min())} frames of"
                 f" {batch.dt:g} s; give a time within it"
             )
-        given = _values(parameters, [pair.pair_id for pair in recording], made)
+        given = _values(parameters, recording.ids, made)
         ahead = Leader(
             batch.leader_position[:, first:],
             batch.leader_speed[:, first:],

@@ -100,7 +100,7 @@ class BotorchSettings(Settings):
 
 
 class BotorchOptimizer(Optimizer):
-    """Gaussian-process optimisation of all problems of a chunk at once.
+    """Gaussian-process optimisation of all problems of a shard at once.
 
     One candidate of each problem is evaluated per iteration (q = 1). First, guesses and Sobol
     points are evaluated, `initial` in all. Then, `iterations` times, a Gaussian process is fitted
@@ -137,7 +137,7 @@ class BotorchOptimizer(Optimizer):
         "restarts": 2,
         "climb_steps": 3,
     }
-    in_parts = True
+    in_shards = True
 
     def evaluations(self) -> int:
         return self.space_filling() + self.settings.iterations
@@ -162,10 +162,10 @@ class BotorchOptimizer(Optimizer):
         settings = self.settings
         problems, g, n = guesses.shape
         check_room(settings.initial, g, key="initial")
-        points = sobol(self.space_filling() - g, n, seed=seed, like=guesses)
+        points = sobol(self.space_filling() - g, n, seed=seed, device=guesses.device)
         tried = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
         losses = objective(tried)
-        search = _Search(settings, tried, losses, guesses=g, seed=seed)
+        search = _BatchSearch(settings, tried, losses, guesses=g, seed=seed)
         for _ in range(settings.iterations):
             candidate = search.ask()
             loss = objective(candidate)
@@ -174,8 +174,8 @@ class BotorchOptimizer(Optimizer):
         return tried, losses
 
 
-class _Search:
-    """The Gaussian processes of a chunk of problems: their evaluations and next candidates."""
+class _BatchSearch:
+    """The Gaussian processes of a shard of problems: their evaluations and next candidates."""
 
     def __init__(
         self, settings: BotorchSettings, tried: Tensor, losses: Tensor, *, guesses: int, seed: int
@@ -385,13 +385,13 @@ class _Marginals(Model):
         # Without this, the few queries of a climb would be taken as dense and their diagonal
         # covariance filled up.
         with max_eager_kernel_size(0):
-            found = self._process.posterior(X.squeeze(-2).transpose(0, 1))
-            return _Normal(
-                found.mean.transpose(0, 1)[..., None], found.variance.transpose(0, 1)[..., None]
-            )
+            # (m, P, 1, n) -> (P, m, n), and back: (P, m) -> (m, P, 1).
+            posterior = self._process.posterior(X.squeeze(-2).transpose(0, 1))
+            mean = posterior.mean.transpose(0, 1)[..., None]
+            return _IndependentNormal(mean, posterior.variance.transpose(0, 1)[..., None])
 
 
-class _Normal(Posterior):
+class _IndependentNormal(Posterior):
     """Independent normal distributions: what an analytic acquisition function needs."""
 
     def __init__(self, mean: Tensor, variance: Tensor) -> None:

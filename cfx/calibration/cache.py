@@ -35,8 +35,8 @@ log = logging.getLogger(__name__)
 Arrays = dict[str, NDArray[Any]]
 """The arrays of an entry, by name."""
 
-_SHARES = 32
-"""Parts in which processes claim the entries of one calibration."""
+_SHARDS = 32
+"""Shards in which processes claim the entries of one calibration."""
 
 _MARK = b"cfx calibration 1 "
 """First bytes of an entry; the number counts layouts."""
@@ -59,8 +59,12 @@ class Cache:
     """
 
     def __init__(self, folder: Path | str | None) -> None:
-        self.folder = None if isinstance(folder, str) else folder
-        self._remote = RemoteFolder(folder) if isinstance(folder, str) else None
+        self.folder: Path | None = None
+        self._remote: RemoteFolder | None = None
+        if isinstance(folder, str):
+            self._remote = RemoteFolder(folder)
+        else:
+            self.folder = folder
 
     def get(self, key: str) -> Arrays | None:
         """Returns the entry, or None if there is none or it is damaged."""
@@ -71,7 +75,9 @@ class Cache:
             with np.load(io.BytesIO(_checked(whole)), allow_pickle=False) as archive:
                 return {name: archive[name] for name in archive.files}
         except (OSError, ValueError, zipfile.BadZipFile, EOFError):
-            where = key if self.folder is None else self.folder / _name(key)
+            where: str | Path = key
+            if self.folder is not None:
+                where = self.folder / _name(key)
             log.warning("The cached calibration %s is damaged; it is computed again.", where)
             return None
 
@@ -115,8 +121,8 @@ class Cache:
             raise ValueError("larger than any entry")
         return path.read_bytes()
 
-    def shares(self, keys: Sequence[str], scope: str) -> dict[str, list[int]]:
-        """Returns the parts in which entries are claimed: the part's name -> positions in `keys`.
+    def shards(self, keys: Sequence[str], scope: str) -> dict[str, list[int]]:
+        """Returns the shards in which entries are claimed: the shard's name -> positions in `keys`.
 
         Args:
             keys: of the entries.
@@ -124,28 +130,30 @@ class Cache:
                 entry then have no common claim, but for a rare coincidence, which costs a little
                 waiting and nothing else.
         """
-        parts: dict[str, list[int]] = {}
+        shards: dict[str, list[int]] = {}
         for position, key in enumerate(keys):
-            share = 0 if self.folder is None else int(key[:8], 16) % _SHARES
+            number = 0
+            if self.folder is not None:
+                number = int(key[:8], 16) % _SHARDS
             # Three digits: there are never more than 4096 lock files, however many calibrations the
             # cache sees.
-            name = hashlib.sha256(f"{scope} {share}".encode()).hexdigest()[:3]
-            parts.setdefault(name, []).append(position)
-        return parts
+            name = hashlib.sha256(f"{scope} {number}".encode()).hexdigest()[:3]
+            shards.setdefault(name, []).append(position)
+        return shards
 
     @contextmanager
     def claim(self, sizes: Mapping[str, int], enough: float) -> Iterator[list[str]]:
-        """Claims shares while the block lasts.
+        """Claims shards while the block lasts.
 
         Nothing is claimed while this waits, so there is no deadlock.
 
         Args:
-            sizes: problems in each share that is wanted; at least one share.
-            enough: no further share is claimed that would bring the claimed problems above this
-                number; at least one share is always claimed.
+            sizes: problems in each shard that is wanted; at least one shard.
+            enough: no further shard is claimed that would bring the claimed problems above this
+                number; at least one shard is always claimed.
 
         Yields:
-            The names of the claimed shares: free ones if there are any, else the first one that
+            The names of the claimed shards: free ones if there are any, else the first one that
             another process lets go.
 
         Raises:
@@ -169,9 +177,10 @@ class Cache:
         if self.folder is None:
             return True
         lock = lock_for(self.folder / "claims" / f"{name}.lock")
+        timeout_s = -1 if wait else 0  # -1: without end
         try:
             Path(lock.lock_file).parent.mkdir(parents=True, exist_ok=True)
-            held.enter_context(lock.acquire(timeout=-1 if wait else 0, poll_interval=_POLL_S))
+            held.enter_context(lock.acquire(timeout=timeout_s, poll_interval=_POLL_S))
         except Timeout:
             return False
         except OSError as error:
@@ -179,7 +188,9 @@ class Cache:
         return True
 
     def _unwritable(self, error: OSError) -> OutputError:
-        where = self.folder if self._remote is None else self._remote.url
+        where: str | Path | None = self.folder
+        if self._remote is not None:
+            where = self._remote.url
         return OutputError(
             f"cannot write the calibration cache {where}: {error.strerror or error};"
             " set cache.folder to a folder that can be written, or cache.enabled=false"
@@ -187,25 +198,25 @@ class Cache:
 
 
 def first_fit(sizes: Mapping[str, int], enough: int) -> list[list[str]]:
-    """Puts shares together as claims would that find all of them free, one claim after the other.
+    """Puts shards together as claims would that find all of them free, one claim after the other.
 
     Args:
-        sizes: problems in each share.
-        enough: problems in each claim at most, but for one share that alone has more.
+        sizes: problems in each shard.
+        enough: problems in each claim at most, but for one shard that alone has more.
     """
     left = dict(sizes)
-    bundles: list[list[str]] = []
+    claims: list[list[str]] = []
     while left:
-        bundle: list[str] = []
+        claim: list[str] = []
         problems = 0
         for name, size in left.items():
-            if not bundle or problems + size <= enough:
-                bundle.append(name)
+            if not claim or problems + size <= enough:
+                claim.append(name)
                 problems += size
-        for name in bundle:
+        for name in claim:
             del left[name]
-        bundles.append(bundle)
-    return bundles
+        claims.append(claim)
+    return claims
 
 
 def _name(key: str) -> str:

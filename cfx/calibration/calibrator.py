@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -32,24 +32,24 @@ from cfx.core.progress import Task
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.simulation.windows import Windows, WindowSettings
 
-_GROUP = 1024
-"""Problems solved together: enough to fill the batch, few enough that an interruption loses
-little."""
+_CLAIM = 1024
+"""Problems that are claimed and solved together: enough to fill the batch, few enough that an
+interruption loses little."""
 
-_PART = 64
+_TRAJECTORIES_OF_SHARD = 64
 """Whole trajectories that are solved in one shard of a cluster: each is the work of a hundred
 windows."""
 
 _FRAMES_AT_ONCE = 200_000
 """Frames of trajectories that are simulated at once to report their losses: some 30 MB."""
 
-_BLOCK = 32
+_WINDOWS_OF_ENTRY = 32
 """Windows of an entry of the cache: the first windows of a pair have the same labels, however many
 of them a job asks for."""
 
 
 @dataclass(frozen=True)
-class Labels:
+class WindowLabels:
     """The best parameters of each window.
 
     Attributes:
@@ -70,14 +70,14 @@ class Labels:
     sensitivity: Tensor
     diverged: Tensor
 
-    def select(self, pairs: Tensor) -> Labels:
+    def select(self, pairs: Tensor) -> WindowLabels:
         """Returns the labels of some pairs, `(D,)` int64, which are numbered anew.
 
         A pair may stand there more than once.
         """
         windows, places = self.windows.select(pairs.cpu())
         places = places.to(self.loss.device)
-        return Labels(
+        return WindowLabels(
             windows,
             self.parameters[places],
             self.loss[places],
@@ -99,8 +99,9 @@ class Labels:
         objective's unit), diverged.
         """
         windows = self.windows
+        pair_ids = [pairs[number].pair_id for number in windows.pair.tolist()]
         columns: dict[str, Any] = {
-            "pair_id": [pairs[index].pair_id for index in windows.pair.tolist()],
+            "pair_id": pair_ids,
             "window": windows.number.numpy(),
             "time_s": windows.first.numpy() * pairs.dt,
         }
@@ -161,7 +162,7 @@ class Calibrator:
         Returns:
             `(P, n)`, SI units.
         """
-        asked, batch = batch.lengths.device, self._where_it_is_fast(batch)
+        requested_device, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         last = last.to(device)
         keys = []
@@ -170,9 +171,9 @@ class Calibrator:
 
         compiled = self._has_kernel(batch)
 
-        def shard(chosen: Tensor, group: Tensor) -> SegmentShard:
+        def shard(chosen: Tensor, claim: Tensor) -> SegmentShard:
             chosen = chosen.to(device)
-            solver = self._solver_for(len(group) * int(last[group].max()))
+            solver = self._solver_for(len(claim) * int(last[claim].max()))
             return SegmentShard(
                 solver,
                 self._code,
@@ -184,8 +185,9 @@ class Calibrator:
             )
 
         title = "Driver-specific parameters"
-        results = self._cached(title, keys, [1] * len(pairs), shard, part=_PART)
-        return _stacked(results, asked)
+        sizes = [1] * len(pairs)
+        results = self._cached(title, keys, sizes, shard, at_most=_TRAJECTORIES_OF_SHARD)
+        return _stacked(results, requested_device)
 
     def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
         """Finds one parameter set for each of K groups of pairs: the pooled parameters.
@@ -201,7 +203,7 @@ class Calibrator:
         Returns:
             `(K, n)`, SI units.
         """
-        asked, batch = batch.lengths.device, self._where_it_is_fast(batch)
+        requested_device, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         members, last = members.cpu(), last.to(device)
         keys = []
@@ -211,7 +213,7 @@ class Calibrator:
 
         compiled = self._has_kernel(batch)
 
-        def shard(chosen: Tensor, _group: Tensor) -> PooledShard:
+        def shard(chosen: Tensor, _claim: Tensor) -> PooledShard:
             groups = members[chosen].to(device)
             used = groups.any(0).nonzero()[:, 0]
             trajectories = batch[used].trimmed()
@@ -219,11 +221,13 @@ class Calibrator:
                 self.solver, self._code, compiled, trajectories, last[used], groups[:, used]
             )
 
-        # Not cut into parts: groups share candidates, and what is simulated for one serves all.
+        # One shard: groups have candidates in common, and what is simulated for one serves all.
         results = self._cached("Pooled parameters", keys, [1] * len(members), shard)
-        return _stacked(results, asked)
+        return _stacked(results, requested_device)
 
-    def labels(self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor) -> Labels:
+    def labels(
+        self, pairs: PairSet, batch: PairBatch, windows: Windows, fixed: Tensor
+    ) -> WindowLabels:
         """Finds the parameters of each window; ties go to the driver-specific parameters.
 
         Not to the pooled ones: labels would depend on the fold and be calibrated once for each.
@@ -234,7 +238,7 @@ class Calibrator:
             windows: W windows of these pairs.
             fixed: `(P, n)`, SI units: the first guess in each window, before the model's defaults.
         """
-        asked, batch = batch.lengths.device, self._where_it_is_fast(batch)
+        requested_device, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         fixed = fixed.to(device)
         counts = torch.bincount(windows.pair, minlength=len(pairs))
@@ -243,8 +247,8 @@ class Calibrator:
         keys, owner, begin, sizes = [], [], [], []
         rows = zip(pairs, counts.tolist(), fixed.tolist(), strict=True)
         for number, (pair, count, row) in enumerate(rows):
-            for first in range(0, count, _BLOCK):
-                size = min(_BLOCK, count - first)
+            for first in range(0, count, _WINDOWS_OF_ENTRY):
+                size = min(_WINDOWS_OF_ENTRY, count - first)
                 which = {"first": first, "windows": size, "fixed": row}
                 keys.append(self._key("labels", pair.fingerprint, **which, **description))
                 owner.append(number)
@@ -252,23 +256,26 @@ class Calibrator:
                 sizes.append(size)
         defaults = self.space.defaults(device=device).expand_as(fixed)
         guesses = self.space.to_unit(torch.stack([fixed, defaults], dim=1))
-        of_block = (torch.tensor(owner), torch.tensor(begin), torch.tensor(sizes))
+        pair_of_entry = torch.tensor(owner)
+        first_of_entry, size_of_entry = torch.tensor(begin), torch.tensor(sizes)
 
         compiled = self._has_kernel(batch)
 
-        def shard(chosen: Tensor, _group: Tensor) -> SegmentShard:
-            pair, first, count = (values[chosen] for values in of_block)
-            block = torch.arange(len(chosen)).repeat_interleave(count)
-            number = torch.arange(len(block)) - (count.cumsum(0) - count)[block]
-            used, place = torch.unique(pair, return_inverse=True)
+        def shard(chosen: Tensor, _claim: Tensor) -> SegmentShard:
+            count = size_of_entry[chosen]
+            # The entry of each window, and the window's number in it.
+            entry = torch.arange(len(chosen)).repeat_interleave(count)
+            number = torch.arange(len(entry)) - (count.cumsum(0) - count)[entry]
+            used, place = torch.unique(pair_of_entry[chosen], return_inverse=True)
             used = used.to(device)
-            start = ((first[block] + number) * windows.settings.stride).to(device)
+            window = first_of_entry[chosen][entry] + number
+            start = (window * windows.settings.stride).to(device)
             return SegmentShard(
                 self.solver,
                 self._code,
                 compiled,
                 batch[used].trimmed(),
-                pair=place[block].to(device),
+                pair=place[entry].to(device),
                 first=start,
                 steps=torch.full_like(start, windows.settings.length),
                 counts=tuple(count.tolist()),
@@ -280,9 +287,9 @@ class Calibrator:
         results = self._cached(title, keys, sizes, shard, **description)
         joined = {}
         for name in results[0]:
-            parts = np.concatenate([entry[name] for entry in results])
-            joined[name] = torch.as_tensor(parts).to(asked)
-        return Labels(windows=windows, **joined)
+            values = np.concatenate([entry[name] for entry in results])
+            joined[name] = torch.as_tensor(values).to(requested_device)
+        return WindowLabels(windows=windows, **joined)
 
     @torch.no_grad()
     def losses(
@@ -311,10 +318,11 @@ class Calibrator:
         last = last.to(device)
         size = max(1, _FRAMES_AT_ONCE // int(last.max()))
         means = dict.fromkeys(self.reported, 0.0)
-        for part in torch.split(torch.arange(len(pair), device=device), size):
-            own = pair[part]
-            losses = self.solver.segments(batch, own, torch.zeros_like(own), last[own])
-            frames = losses.simulated(losses.parameters(unit[part]), gap=True)
+        for shard in torch.split(torch.arange(len(pair), device=device), size):
+            simulated = pair[shard]
+            first = torch.zeros_like(simulated)
+            losses = self.solver.segments(batch, simulated, first, last[simulated])
+            frames = losses.simulated(losses.parameters(unit[shard]), gap=True)
             for name, objective in self.reported.items():
                 loss = objective(frames, losses.segments.counted[..., None])
                 means[name] += float(loss.sum()) / len(pair)
@@ -337,7 +345,9 @@ class Calibrator:
 
     @property
     def _prior_key(self) -> dict[str, float]:
-        return {"prior": self.solver.prior} if self.solver.prior else {}
+        if self.solver.prior == 0:
+            return {}
+        return {"prior": self.solver.prior}
 
     def _cached(
         self,
@@ -345,7 +355,7 @@ class Calibrator:
         keys: list[str],
         problems: list[int],
         shard: Callable[[Tensor, Tensor], CalibrationShard],
-        part: int = _GROUP,
+        at_most: int = _CLAIM,
         **scope: Any,
     ) -> list[Arrays]:
         """Returns one entry per key; solves what neither the cache nor another process provides.
@@ -354,46 +364,48 @@ class Calibrator:
             what: what is calibrated, for the progress display.
             keys: of the entries.
             problems: how many each entry stands for.
-            shard: takes the numbers of entries, and those of the group that they are cut from, and
+            shard: takes the numbers of entries, and those of the claim that they are cut from, and
                 returns what solves these entries.
-            part: problems in each shard at most, where groups are cut.
+            at_most: problems in each shard, where claims are cut.
             scope: settings that all keys share, besides those of the calibrator.
         """
-        together = _GROUP
-        enough: float = _GROUP
-        if self.solver.optimizer.in_parts or (
-            self.solver.optimizer.in_threads and self.engine.distributes
-        ):
-            together = min(part, _GROUP)
+        optimizer = self.solver.optimizer
+        shard_size, enough = _CLAIM, float(_CLAIM)
+        if optimizer.in_shards or (optimizer.in_threads and self.engine.distributes):
+            shard_size = min(at_most, _CLAIM)
         if self.engine.distributes:
+            # Its workers share all that there is: it is claimed at once.
             enough = math.inf
-        work = _Work(self.cache, keys, problems, self.solver.optimizer.evaluations(), together)
-        wanted = work.shares(self._key(what, "", **scope))
-        optimizer = type(self.solver.optimizer).__name__
-        objective = type(self.solver.objective).__name__
-        if self.solver.objective.unit:
-            objective = f"{objective} in {self.solver.objective.unit}"
-        title = f"{what} ({optimizer}, {objective}, {work.missing_problems} problems)"
-        with self.progress(title, work.missing_problems * work.evaluations) as task:
-            while wanted:
-                with self.cache.claim(work.sizes(wanted), enough) as claimed:
-                    mine = {name: wanted.pop(name) for name in claimed}
-                    parts = work.parts(mine, task)
-                    shards = (shard(*part) for part in parts)
+        work = _Work(self.cache, keys, problems, optimizer.evaluations(), shard_size)
+        missing = work.missing_by_cache_shard(self._key(what, "", **scope))
+        with self.progress(self._title(what, work), work.missing_evaluations) as task:
+            while missing:
+                with self.cache.claim(work.sizes(missing), enough) as claimed:
+                    entries = {name: missing.pop(name) for name in claimed}
+                    cuts = work.cut(entries, task)
+                    shards = itertools.starmap(shard, cuts)
                     solved = self.engine.map(CalibrationShard.solve, shards, task.advance)
                     with closing(solved) as results:
-                        for number, entries in results:
-                            work.keep(parts[number][0], entries)
+                        for number, solution in results:
+                            work.keep(cuts[number].entries, solution)
         return work.results()
 
+    def _title(self, what: str, work: _Work) -> str:
+        """Returns what a progress display says."""
+        optimizer, objective = self.solver.optimizer, self.solver.objective
+        minimised = type(objective).__name__
+        if objective.unit:
+            minimised = f"{minimised} in {objective.unit}"
+        return f"{what} ({type(optimizer).__name__}, {minimised}, {work.missing_problems} problems)"
+
     def _solver_for(self, steps: int) -> Solver:
-        """Returns the solver of a group of problems, for any part of it.
+        """Returns the solver of a claim's problems, for any shard of it.
 
         Whether work is compiled depends on how much there is, and its last bits on that: `steps`
-        of all problems of the group, for one candidate.
+        of all problems of the claim, for one candidate.
         """
-        simulator = self.solver.simulator.for_work(steps * self.solver.optimizer.evaluations())
-        return replace(self.solver, simulator=simulator)
+        stepper = self.solver.stepper.for_work(steps * self.solver.optimizer.evaluations())
+        return replace(self.solver, stepper=stepper)
 
     @cached_property
     def _scope(self) -> dict[str, Any]:
@@ -407,6 +419,13 @@ class Calibrator:
         return content_key({"what": what, "pair": pair, **self._scope, **details})
 
 
+class _Cut(NamedTuple):
+    """Entries that one shard solves, and all of the claim that they are cut from: their numbers."""
+
+    entries: Tensor
+    claim: Tensor
+
+
 class _Work:
     """The entries of one calibration: those cached, and those still to be solved.
 
@@ -416,50 +435,59 @@ class _Work:
     """
 
     def __init__(
-        self, cache: Cache, keys: list[str], problems: list[int], evaluations: int, together: int
+        self, cache: Cache, keys: list[str], problems: list[int], evaluations: int, shard_size: int
     ) -> None:
         self._cache = cache
         self._keys = keys
         self._problems = problems
-        self._together = together
+        self._shard_size = shard_size
         self._entries = [cache.get(key) for key in keys]
         self.evaluations = evaluations
         self.missing_problems = self._size(self._missing(range(len(keys))))
 
-    def shares(self, scope: str) -> dict[str, list[int]]:
-        """Returns the missing entries by the share of the cache in which they are claimed."""
+    @property
+    def missing_evaluations(self) -> int:
+        """Evaluations of all problems that the cache did not hold at the start."""
+        return self.missing_problems * self.evaluations
+
+    def missing_by_cache_shard(self, scope: str) -> dict[str, list[int]]:
+        """Returns the missing entries by the shard of the cache in which they are claimed."""
         missing = self._missing(range(len(self._keys)))
-        shares = {}
+        by_shard = {}
         keys = [self._keys[index] for index in missing]
-        for name, positions in self._cache.shares(keys, scope).items():
-            shares[name] = [missing[position] for position in positions]
-        return shares
+        for name, positions in self._cache.shards(keys, scope).items():
+            by_shard[name] = [missing[position] for position in positions]
+        return by_shard
 
-    def sizes(self, shares: Mapping[str, list[int]]) -> dict[str, int]:
-        """Returns how many problems the entries of each share stand for."""
-        return {name: self._size(indices) for name, indices in shares.items()}
+    def sizes(self, entries: Mapping[str, list[int]]) -> dict[str, int]:
+        """Returns how many problems the entries in each shard of the cache stand for."""
+        return {name: self._size(indices) for name, indices in entries.items()}
 
-    def parts(self, shares: dict[str, list[int]], task: Task) -> list[tuple[Tensor, Tensor]]:
-        """Returns what is left of claimed shares: entries to solve, with the group they belong to.
+    def cut(self, claimed: Mapping[str, list[int]], task: Task) -> list[_Cut]:
+        """Cuts what is left of the entries in claimed shards of the cache into shards of work.
 
-        Another process may have solved some before the claim. Shares are put together as an engine
-        claims them that solves one group after the other, so that every engine has the same groups.
+        Another process may have solved some before the claim. Shards of the cache are put together
+        as an engine claims them that solves one claim after the other, so that every engine has the
+        same claims.
         """
-        parts = []
-        for names in first_fit(self.sizes(shares), _GROUP):
-            indices = sorted(itertools.chain.from_iterable(shares[name] for name in names))
+        cuts = []
+        for names in first_fit(self.sizes(claimed), _CLAIM):
+            indices: list[int] = []
+            for name in names:
+                indices += claimed[name]
+            indices.sort()
             for index in indices:
                 self._entries[index] = self._cache.get(self._keys[index])
             left = self._missing(indices)
             task.advance(self.evaluations * (self._size(indices) - self._size(left)))
-            for group in _runs(left, self._problems, _GROUP):
-                for part in _runs(group, self._problems, self._together):
-                    parts.append((torch.tensor(part), torch.tensor(group)))
-        return parts
+            for claim in _in_order(left, self._problems, _CLAIM):
+                for shard in _in_order(claim, self._problems, self._shard_size):
+                    cuts.append(_Cut(torch.tensor(shard), torch.tensor(claim)))
+        return cuts
 
-    def keep(self, part: Tensor, entries: list[Arrays]) -> None:
-        """Keeps what was solved."""
-        for index, entry in zip(part.tolist(), entries, strict=True):
+    def keep(self, numbers: Tensor, entries: list[Arrays]) -> None:
+        """Keeps the entries of these numbers, which were solved."""
+        for index, entry in zip(numbers.tolist(), entries, strict=True):
             self._cache.put(self._keys[index], entry)
             self._entries[index] = entry
 
@@ -474,26 +502,29 @@ class _Work:
         return [index for index in indices if self._entries[index] is None]
 
 
-def _runs(indices: list[int], problems: list[int], together: int) -> Iterator[list[int]]:
-    """Yields runs of indices with at most this many problems, or one index that alone has more."""
-    group: list[int] = []
+def _in_order(indices: list[int], problems: list[int], at_most: int) -> Iterator[list[int]]:
+    """Cuts indices, in order, where more than `at_most` problems would come together.
+
+    One index that alone has more stands alone.
+    """
+    taken: list[int] = []
     size = 0
     for index in indices:
-        if group and size + problems[index] > together:
-            yield group
-            group, size = [], 0
-        group.append(index)
+        if taken and size + problems[index] > at_most:
+            yield taken
+            taken, size = [], 0
+        taken.append(index)
         size += problems[index]
-    if group:
-        yield group
+    if taken:
+        yield taken
 
 
 def _group_key(pairs: Sequence[Pair] | PairSet, last: Tensor, members: Tensor) -> list[Any]:
     """Returns what identifies a group of pairs `(P,)` bool: each one's content and last frame."""
-    found = []
+    identities = []
     for index in members.nonzero()[:, 0].tolist():
-        found.append((pairs[index].fingerprint, int(last[index])))
-    return sorted(found)
+        identities.append((pairs[index].fingerprint, int(last[index])))
+    return sorted(identities)
 
 
 def _stacked(entries: list[Arrays], device: torch.device) -> Tensor:

@@ -108,7 +108,7 @@ class GradientSearch(RandomSearch):
         check_room(settings.first, g, key="samples")
         each_step = n + len(_LENGTHS)
         stages, rest = _stages(settings.searches, settings.samples - settings.first, each_step)
-        points = sobol(settings.first - g + rest, n, seed=seed, like=guesses)
+        points = sobol(settings.first - g + rest, n, seed=seed, device=guesses.device)
         shared = points.expand(problems, -1, -1)
         tried, losses = [guesses, shared], [objective(guesses)]
         losses.append(objective(shared))
@@ -117,13 +117,13 @@ class GradientSearch(RandomSearch):
             search = _best(search, searches)
             for _ in range(rounds):
                 around = _around(search.point)
-                found = objective(around.flatten(1, 2))
-                search = _with_slope(search, around, found.view(around.shape[:3]))
+                beside = objective(around.flatten(1, 2))
+                search = _with_slope(search, around, beside.view(around.shape[:3]))
                 steps = _steps(search)
                 lower = objective(steps.flatten(1, 2))
                 search = _stepped(search, steps, lower.view(steps.shape[:3]))
                 tried += [around.flatten(1, 2), steps.flatten(1, 2)]
-                losses += [found, lower]
+                losses += [beside, lower]
         # The extra points stand before the searches, in the order of evaluation.
         return tuple(tried), torch.cat(losses, dim=1)
 
@@ -144,7 +144,7 @@ def _stages(searches: int, samples: int, each_step: int) -> tuple[list[tuple[int
     return [*stages, (searches, rounds)], rest
 
 
-class _Search(NamedTuple):
+class _LocalSearches(NamedTuple):
     """S local searches of P problems.
 
     Attributes:
@@ -166,7 +166,7 @@ class _Search(NamedTuple):
     radius: Tensor
 
 
-def _start(losses: Tensor, guesses: Tensor, shared: Tensor, starts: int) -> _Search:
+def _start(losses: Tensor, guesses: Tensor, shared: Tensor, starts: int) -> _LocalSearches:
     """Returns searches at the `starts` best points of each problem."""
     loss, index = losses.topk(starts, dim=1, largest=False)
     g, n = guesses.shape[1:]
@@ -175,7 +175,7 @@ def _start(losses: Tensor, guesses: Tensor, shared: Tensor, starts: int) -> _Sea
         place = (index - g).clamp(min=0)
         of_guess = of_guess.where((index < g)[..., None], shared[0][place])
     nothing = torch.zeros_like(of_guess)
-    return _Search(
+    return _LocalSearches(
         point=of_guess,
         loss=loss,
         slope=nothing,
@@ -186,7 +186,7 @@ def _start(losses: Tensor, guesses: Tensor, shared: Tensor, starts: int) -> _Sea
     )
 
 
-def _best(search: _Search, count: int) -> _Search:
+def _best(search: _LocalSearches, count: int) -> _LocalSearches:
     """Returns the searches of each problem that have come lowest."""
     if count == search.loss.shape[1]:
         return search
@@ -195,7 +195,7 @@ def _best(search: _Search, count: int) -> _Search:
     for value in search:
         places = index.view(*index.shape, *[1] * (value.dim() - 2))
         chosen.append(value.gather(1, places.expand(-1, -1, *value.shape[2:])))
-    return _Search(*chosen)
+    return _LocalSearches(*chosen)
 
 
 def _identity(point: Tensor) -> Tensor:
@@ -211,7 +211,7 @@ def _around(point: Tensor) -> Tensor:
     return point[:, :, None] + shift * inwards[:, :, None]
 
 
-def _with_slope(search: _Search, around: Tensor, losses: Tensor) -> _Search:
+def _with_slope(search: _LocalSearches, around: Tensor, losses: Tensor) -> _LocalSearches:
     """Measures slopes, and learns the second derivatives from how they changed."""
     apart = torch.diagonal(around, dim1=-2, dim2=-1) - search.point
     slope = (losses - search.loss[:, :, None]) / apart
@@ -220,7 +220,7 @@ def _with_slope(search: _Search, around: Tensor, losses: Tensor) -> _Search:
     return search._replace(slope=slope, inverse=inverse, fresh=fresh)
 
 
-def _learned(search: _Search, slope: Tensor) -> tuple[Tensor, Tensor]:
+def _learned(search: _LocalSearches, slope: Tensor) -> tuple[Tensor, Tensor]:
     """Returns the inverse after the BFGS update, where the last step says something."""
     s, y = search.moved[..., None], (slope - search.slope)[..., None]
     curvature = (s * y).sum((-2, -1))
@@ -237,14 +237,15 @@ def _learned(search: _Search, slope: Tensor) -> tuple[Tensor, Tensor]:
     return inverse, search.fresh & ~usable
 
 
-def _steps(search: _Search) -> Tensor:
+def _steps(search: _LocalSearches) -> Tensor:
     """Returns where steps of several lengths lead, `(P, S, lengths, n)`."""
     slope = search.slope
     blocked = ((search.point <= 0.0) & (slope > 0.0)) | ((search.point >= 1.0) & (slope < 0.0))
     free = slope.where(~blocked, 0.0)
-    wanted = -(search.inverse @ free[..., None]).squeeze(-1).where(~blocked, 0.0)
-    downhill = ((wanted * free).sum(-1) < 0.0) & ~search.fresh
-    step = wanted.where(downhill[..., None], -free)
+    # The quasi-Newton step -H g (Nocedal and Wright, 6.2), along the bounds where they block it.
+    newton = -(search.inverse @ free[..., None]).squeeze(-1).where(~blocked, 0.0)
+    downhill = ((newton * free).sum(-1) < 0.0) & ~search.fresh
+    step = newton.where(downhill[..., None], -free)
     longest = step.abs().amax(-1).clamp(min=1e-300)
     # Plain gradients have no scale: they go as far as they may.
     scale = search.radius / longest
@@ -254,7 +255,7 @@ def _steps(search: _Search) -> Tensor:
     return (search.point[:, :, None] + moved).clamp(0.0, 1.0)
 
 
-def _stepped(search: _Search, steps: Tensor, losses: Tensor) -> _Search:
+def _stepped(search: _LocalSearches, steps: Tensor, losses: Tensor) -> _LocalSearches:
     """Takes the best length of each step; where none is better, the next one is shorter."""
     lowest, index = losses.min(dim=2)
     n = steps.shape[-1]

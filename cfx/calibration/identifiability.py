@@ -98,29 +98,27 @@ def training_errors(
     """
     unit = calibrator.space.to_unit(parameters)[:, None]
     objectives: dict[str, Objective] = {"rmse_speed": SpeedRmse(), "rmse_gap": GapRmse()}
-    found = {}
+    errors = {}
     for name, objective in objectives.items():
-        found[name] = losses_of(calibrator, objective, batch, last, unit)[:, 0]
-    return found
+        errors[name] = losses_of(calibrator, objective, batch, last, unit)[:, 0]
+    return errors
 
 
 @torch.no_grad()
 def losses_of(
     calibrator: Calibrator, objective: Objective, batch: PairBatch, last: Tensor, candidates: Tensor
 ) -> Tensor:
-    """Returns losses `(P, q)` of candidates `(P, q, n)` in unit space, pair by pair in chunks."""
-    parts = []
-    for own in torch.split(torch.arange(len(batch), device=candidates.device), _PAIRS_AT_ONCE):
-        first, end = torch.zeros_like(own), last.to(own.device)[own]
-        segments = SegmentLosses.of_segments(
-            calibrator.solver.simulator, objective, batch, own, first, end
-        )
+    """Returns losses `(P, q)` of candidates `(P, q, n)` in unit space, in shards of pairs."""
+    losses, solver = [], calibrator.solver
+    for pairs in torch.split(torch.arange(len(batch), device=candidates.device), _PAIRS_AT_ONCE):
+        first, end = torch.zeros_like(pairs), last.to(pairs.device)[pairs]
+        segments = SegmentLosses.of_segments(solver.stepper, objective, batch, pairs, first, end)
         per_pair = segments.bytes_per_candidate * candidates.shape[1]
-        size = max(1, calibrator.solver.memory // max(1, per_pair))
-        for some in torch.split(torch.arange(len(own), device=own.device), size):
-            parts.append(segments.take(some)(candidates[own[some]]))
+        size = max(1, solver.memory // max(1, per_pair))
+        for shard in torch.split(torch.arange(len(pairs), device=pairs.device), size):
+            losses.append(segments.take(shard)(candidates[pairs[shard]]))
         memory.release()
-    return torch.cat(parts)
+    return torch.cat(losses)
 
 
 NEARLY_BEST = 0.05
@@ -166,10 +164,10 @@ def flat_for(table: pd.DataFrame, names: Sequence[str]) -> dict[str, float]:
         table: a row per pair and method, with columns as of `with_flat_shares` if they are known.
         names: of the parameters.
     """
-    found = {}
+    flat = {}
     for name in names:
         if f"{FLAT_SHARE_PREFIX}{name}" in table:
-            known = table[f"{FLAT_SHARE_PREFIX}{name}"].dropna()
-            if len(known):
-                found[name] = float((known == 1).mean())
-    return found
+            shares = table[f"{FLAT_SHARE_PREFIX}{name}"].dropna()
+            if len(shares):
+                flat[name] = float((shares == 1).mean())
+    return flat

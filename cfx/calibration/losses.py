@@ -74,7 +74,9 @@ class Prior:
 
     def cut(self, which: slice | Tensor) -> Prior:
         """Returns the prior of some of the problems."""
-        center = self.center if self.center.dim() == 1 else self.center[which]
+        center = self.center
+        if center.dim() > 1:
+            center = center[which]
         return replace(self, center=center, scale=self.scale[which])
 
     def penalty(self, candidates: Tensor) -> Tensor:
@@ -92,13 +94,13 @@ class SegmentLosses:
     Each segment starts from a measured state behind its measured leader and lasts up to K steps.
 
     Attributes:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         objective: compares the simulated segment with the measured one.
         segments: what was measured, K steps of P segments.
         prior: added to the losses of candidates in unit space; None: none.
     """
 
-    simulator: Stepper
+    stepper: Stepper
     objective: Objective
     segments: Segments
     prior: Prior | None = None
@@ -106,7 +108,7 @@ class SegmentLosses:
     @classmethod
     def of_segments(
         cls,
-        simulator: Stepper,
+        stepper: Stepper,
         objective: Objective,
         batch: PairBatch,
         pair: Tensor,
@@ -116,7 +118,7 @@ class SegmentLosses:
         """Cuts segments out of pairs.
 
         Args:
-            simulator: the model and its time step.
+            stepper: the model and its time step.
             objective: compares the simulated segments with the measured ones.
             batch: the pairs.
             pair: `(P,)`, index of each segment's pair in the batch.
@@ -140,7 +142,7 @@ class SegmentLosses:
             speed=batch.follower_speed[pair, first],
             acceleration=batch.follower_acceleration[pair, first],
         )
-        return cls(simulator, objective, segments)
+        return cls(stepper, objective, segments)
 
     @property
     def problems(self) -> int:
@@ -162,30 +164,32 @@ class SegmentLosses:
         """Memory that one candidate of one problem needs.
 
         Without trajectories: its parameters, in unit space and not, the sums and the loss. Else
-        positions, speeds, a term, its masked copy and the intermediate values of one block; a gap
+        positions, speeds, a term, its masked copy and the intermediate values of one step; a gap
         is another value with another term.
         """
-        parameters = len(self.simulator.model.space.names)
+        parameters = len(self.stepper.model.space.names)
         if self.accumulates:
             values = 3 * parameters + 8
         elif "gap" in self.objective.signals:
             values = 6 * self.steps + 32
         else:
             values = 4 * self.steps + 32
-        of_prior = 0 if self.prior is None else self.prior.bytes_per_candidate
-        return values * self.segments.measured_speed.element_size() + of_prior
+        size = values * self.segments.measured_speed.element_size()
+        if self.prior is not None:
+            size += self.prior.bytes_per_candidate
+        return size
 
     @property
     def accumulates(self) -> bool:
         """Whether losses come from a compiled kernel, given enough work, without trajectories."""
-        space = self.simulator.model.space
+        space = self.stepper.model.space
         defaults = space.to_unit(space.defaults()).to(self.device)
-        return self.simulator.accumulates(self.parameters(defaults[None, None]), self._terms)
+        return self.stepper.accumulates(self.parameters(defaults[None, None]), self.terms)
 
     def for_work(self, candidates: int) -> SegmentLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
         steps = self.problems * self.steps * candidates
-        return replace(self, simulator=self.simulator.for_work(steps))
+        return replace(self, stepper=self.stepper.for_work(steps))
 
     def select(self, first: int, last: int) -> SegmentLosses:
         """Returns problems `first` to `last - 1`."""
@@ -194,8 +198,9 @@ class SegmentLosses:
     def take(self, problems: slice | Tensor) -> SegmentLosses:
         """Returns the problems of numbers `(S,)` int64; one may stand there more than once."""
         segments = Segments(*(values[..., problems] for values in self.segments))
-        prior = None if self.prior is None else self.prior.cut(problems)
-        return replace(self, segments=segments, prior=prior)
+        if self.prior is None:
+            return replace(self, segments=segments)
+        return replace(self, segments=segments, prior=self.prior.cut(problems))
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor | Mapping[str, Tensor]) -> Tensor:
@@ -213,7 +218,7 @@ class SegmentLosses:
         else:
             p = candidates
         counted = self.segments.counted
-        sums = self.simulator.accumulate(self.segments, p, self._terms)
+        sums = self.stepper.accumulate(self.segments, p, self.terms)
         if sums is not None:
             losses = self.objective.finish(sums, counted.sum(0).clamp(min=1)[:, None])
         else:
@@ -231,34 +236,49 @@ class SegmentLosses:
             gap: compute the simulated gap; without, it is NaN.
         """
         s = self.segments
-        shape = common_shape([(self.problems, 1), *[value.shape for value in p.values()]])
-        start = [value[:, None].expand(shape) for value in (s.position, s.speed, s.acceleration)]
-        leader = (s.leader_position, s.leader_speed, s.leader_acceleration, s.leader_length)
-        follower = self.simulator.begin(Start(*start))
-        _, position, speed = self.simulator.advance(
-            follower, Leader(*(value[..., None] for value in leader)), p
+        shapes: list[tuple[int, ...]] = [(self.problems, 1)]
+        for value in p.values():
+            shapes.append(tuple(value.shape))
+        shape = common_shape(shapes)
+        start = Start(
+            s.position[:, None].expand(shape),
+            s.speed[:, None].expand(shape),
+            s.acceleration[:, None].expand(shape),
         )
+        # One leader for all candidates: (K, P, 1) broadcasts to (K, P, q) without a copy.
+        leader = Leader(
+            s.leader_position[..., None],
+            s.leader_speed[..., None],
+            s.leader_acceleration[..., None],
+            s.leader_length[..., None],
+        )
+        _, position, speed = self.stepper.advance(self.stepper.begin(start), leader, p)
+        simulated_gap = speed.new_tensor(torch.nan)
+        if gap:
+            simulated_gap = s.leader_rear[..., None] - position
         return FrameValues(
             speed=speed,
-            gap=s.leader_rear[..., None] - position if gap else speed.new_tensor(torch.nan),
+            gap=simulated_gap,
             measured_speed=s.measured_speed[..., None],
             measured_gap=s.measured_gap[..., None],
-            dt=self.simulator.dt,
+            dt=self.stepper.dt,
         )
 
     @property
-    def _terms(self) -> Terms:
+    def terms(self) -> Terms:
+        """What one frame adds to the sums of the objective."""
+
         def of_frame(
             v: Tensor, gap: Tensor, v_real: Tensor, gap_real: Tensor
         ) -> tuple[Tensor, ...]:
-            return self.objective.terms(FrameValues(v, gap, v_real, gap_real, self.simulator.dt))
+            return self.objective.terms(FrameValues(v, gap, v_real, gap_real, self.stepper.dt))
 
         settings = self.objective.settings.model_dump_json()
         return Terms(of_frame, ComponentKey(type(self.objective), settings))
 
     def parameters(self, candidates: Tensor) -> dict[str, Tensor]:
         """Returns candidates `(P, q, n)` in unit space as one tensor per parameter, SI units."""
-        space = self.simulator.model.space
+        space = self.stepper.model.space
         values = space.from_unit(candidates.to(self.segments.measured_speed.dtype))
         return {name: value.contiguous() for name, value in space.unpack(values).items()}
 
@@ -268,13 +288,13 @@ class FullTrajectories:
     """Pairs from frame 0 to a last one, as segments that are cut out where they are simulated.
 
     Attributes:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         objective: compares the simulated trajectories with the measured ones.
         batch: P pairs.
         last: `(P,)`, the last frame that is compared.
     """
 
-    simulator: Stepper
+    stepper: Stepper
     objective: Objective
     batch: PairBatch
     last: Tensor
@@ -298,7 +318,7 @@ class FullTrajectories:
         """Returns pairs of numbers `(S,)` int64; one may stand there more than once."""
         first, last = torch.zeros_like(problems), self.last[problems]
         return SegmentLosses.of_segments(
-            self.simulator, self.objective, self.batch, problems, first, last
+            self.stepper, self.objective, self.batch, problems, first, last
         )
 
 
@@ -311,11 +331,11 @@ _SUMMED_AT_ONCE = 1 << 25
 again, and stays in the process's own memory (`cfx.core.memory`)."""
 
 _SEGMENTS_AT_ONCE = 1024
-"""Segments that are simulated for a block of candidates: memory does not grow with their number,
-and the block stays long."""
+"""Segments that are simulated for a shard of candidates: memory does not grow with their number,
+and the shard has many candidates."""
 
 _VECTOR = 32
-"""Blocks of candidates are multiples of this, the number that the kernel simulates together."""
+"""Shards of candidates are multiples of this, the number that the kernel simulates together."""
 
 
 @dataclass(frozen=True)
@@ -330,7 +350,7 @@ class PooledLosses:
     Attributes:
         segments: D segments.
         members: the segments of each of K problems, bool `(K, D)`.
-        memory: bound in bytes for what is simulated at once; candidates are simulated in blocks
+        memory: bound in bytes for what is simulated at once; candidates are simulated in shards
             where all segments of all of them need more.
         prior: added to the losses; None: none.
     """
@@ -352,57 +372,92 @@ class PooledLosses:
 
     @property
     def bytes_per_candidate(self) -> int:
-        """Memory of one candidate of one problem besides the blocks: the sum and the mean."""
-        of_prior = 0 if self.prior is None else self.prior.bytes_per_candidate
-        return 2 * torch.float64.itemsize + of_prior
+        """Memory of one candidate of one problem besides the shards: the sum and the mean."""
+        size = 2 * torch.float64.itemsize
+        if self.prior is not None:
+            size += self.prior.bytes_per_candidate
+        return size
 
     def for_work(self, candidates: int) -> PooledLosses:
         """Returns the same losses, for a number of candidates of each problem in all calls."""
         simulated = int(self.members.sum()) * self.segments.steps
-        simulator = self.segments.simulator.for_work(simulated * candidates)
-        return replace(self, segments=replace(self.segments, simulator=simulator))
+        stepper = self.segments.stepper.for_work(simulated * candidates)
+        return replace(self, segments=replace(self.segments, stepper=stepper))
 
     def select(self, first: int, last: int) -> PooledLosses:
         """Returns problems `first` to `last - 1`."""
-        prior = None if self.prior is None else self.prior.cut(slice(first, last))
-        return replace(self, members=self.members[first:last], prior=prior)
+        members = self.members[first:last]
+        if self.prior is None:
+            return replace(self, members=members)
+        return replace(self, members=members, prior=self.prior.cut(slice(first, last)))
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:
         """Returns losses `(K, q)`, in the objective's unit, of candidates `(K, q, n)`."""
         shared = bool((candidates == candidates[:1]).all())
         used = self.members.any(0).nonzero()[:, 0]
-        # The parts are small, but there are many: together they may be worth compiling for, which
-        # none of them is alone.
-        simulated = len(used) if shared else int(self.members.sum())
+        # Shards are small, but there are many: together they may be worth compiling for, which none
+        # of them is alone.
+        simulated = int(self.members.sum())
+        if shared:
+            simulated = len(used)
         work = self.segments.steps * simulated * candidates.shape[1]
-        simulator = self.segments.simulator.for_work(work)
-        segments = replace(self.segments, simulator=simulator)
+        stepper = self.segments.stepper.for_work(work)
+        segments = replace(self.segments, stepper=stepper)
         total = candidates.new_zeros(candidates.shape[:2])
-        for some in torch.split(used, _SEGMENTS_AT_ONCE):
-            members = self.members[:, some]
-            problem, place = members.nonzero().unbind(1)
+        for numbers in torch.split(used, _SEGMENTS_AT_ONCE):
             if shared:
-                own = segments.take(some)
-                for columns, block in self._blocks(own, len(some), total, candidates[:1]):
-                    found = own(block.expand(len(some), -1, -1)).to(total)
-                    columns.index_add_(0, problem, found[place])
-                continue
-            groups = _by_problems(members)
-            taken = [segments.take(some[group.places]) for group in groups]
-            for columns, block in self._blocks(taken[0], len(place), total, candidates):
-                width = block.shape[1]
-                found = columns.new_empty((len(place), width))
-                for own, group in zip(taken, groups, strict=True):
-                    losses = own(block[group.problems].flatten(1, 2))
-                    found[group.members] = losses.to(total).reshape(*group.problems.shape, width)
-                columns.index_add_(0, problem, found)
+                self._add_shared(segments, numbers, total, candidates[:1])
+            else:
+                self._add(segments, numbers, total, candidates)
         losses = total / self.members.sum(1, keepdim=True)
         if self.prior is None:
             return losses
         return losses + self.prior.penalty(candidates)
 
-    def _blocks(
+    def _add_shared(
+        self,
+        segments: SegmentLosses | FullTrajectories,
+        numbers: Tensor,
+        total: Tensor,
+        candidates: Tensor,
+    ) -> None:
+        """Adds the losses of segments for candidates `(1, q, n)` that all problems have.
+
+        Args:
+            segments: all of them.
+            numbers: of those whose losses are added.
+            total: sums of losses `(K, q)`, changed in place.
+            candidates: each is simulated once, whichever problems a segment belongs to.
+        """
+        problem, place = self.members[:, numbers].nonzero().unbind(1)
+        losses_of = segments.take(numbers)
+        for columns, shard in self._shards(losses_of, len(numbers), total, candidates):
+            losses = losses_of(shard.expand(len(numbers), -1, -1)).to(total)
+            columns.index_add_(0, problem, losses[place])
+
+    def _add(
+        self,
+        segments: SegmentLosses | FullTrajectories,
+        numbers: Tensor,
+        total: Tensor,
+        candidates: Tensor,
+    ) -> None:
+        """As `_add_shared`, for candidates `(K, q, n)` of each problem's own."""
+        members = self.members[:, numbers]
+        problem, place = members.nonzero().unbind(1)
+        groups = _by_problems(members)
+        losses_of = [segments.take(numbers[group.places]) for group in groups]
+        for columns, shard in self._shards(losses_of[0], len(place), total, candidates):
+            width = shard.shape[1]
+            losses = columns.new_empty((len(place), width))
+            for losses_of_group, group in zip(losses_of, groups, strict=True):
+                # (G, m, q, n) -> (G, m q, n): a segment is simulated once for all its problems.
+                of_group = losses_of_group(shard[group.problems].flatten(1, 2)).to(total)
+                losses[group.members] = of_group.reshape(*group.problems.shape, width)
+            columns.index_add_(0, problem, losses)
+
+    def _shards(
         self, segments: SegmentLosses, simulated: int, total: Tensor, candidates: Tensor
     ) -> Iterator[tuple[Tensor, Tensor]]:
         """Yields columns of `total` `(K, q)` with their candidates, of `(K, q, n)` or `(1, q, n)`.
@@ -412,14 +467,14 @@ class PooledLosses:
         bound = min(self.memory, _BYTES_AT_ONCE)
         if segments.accumulates:
             bound = min(self.memory, _SUMMED_AT_ONCE)
-        block = max(1, bound // (segments.bytes_per_candidate * simulated))
-        if block > _VECTOR:
-            block -= block % _VECTOR
-        columns = torch.split(total, block, dim=1)
-        yield from zip(columns, torch.split(candidates, block, dim=1), strict=True)
+        size = max(1, bound // (segments.bytes_per_candidate * simulated))
+        if size > _VECTOR:
+            size -= size % _VECTOR
+        columns = torch.split(total, size, dim=1)
+        yield from zip(columns, torch.split(candidates, size, dim=1), strict=True)
 
 
-class _Group(NamedTuple):
+class _SegmentGroup(NamedTuple):
     """Segments that belong to equally many problems, m.
 
     Each is simulated once, for the candidates of all its problems: it is read once, and the kernel
@@ -436,7 +491,7 @@ class _Group(NamedTuple):
     members: Tensor
 
 
-def _by_problems(members: Tensor) -> list[_Group]:
+def _by_problems(members: Tensor) -> list[_SegmentGroup]:
     """Groups segments by the number of their problems, of memberships bool `(K, S)`."""
     number = members.flatten().cumsum(0).reshape(members.shape) - 1
     counts = members.sum(0)
@@ -444,5 +499,5 @@ def _by_problems(members: Tensor) -> list[_Group]:
     for count in sorted(set(counts.tolist())):
         places = (counts == count).nonzero()[:, 0]
         problems = members[:, places].T.nonzero()[:, 1].reshape(len(places), count)
-        groups.append(_Group(places, problems, number[problems, places[:, None]]))
+        groups.append(_SegmentGroup(places, problems, number[problems, places[:, None]]))
     return groups

@@ -8,7 +8,7 @@ neighbouring candidates differ by little.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from threading import Event
 from typing import Any, ClassVar, Protocol
@@ -39,7 +39,7 @@ AT_ONCE = 4096
 an optimizer asks for."""
 
 _LOSSES_AT_ONCE = 1 << 19
-"""Losses of one chunk on a CPU, at most: 4 MB, which are written and read again in its cache."""
+"""Losses of one shard on a CPU, at most: 4 MB, which are written and read again in its cache."""
 
 
 class CandidateLosses(Protocol):
@@ -86,6 +86,16 @@ class Solution:
     filling: Tensor
     diverged: Tensor
 
+    @classmethod
+    def joined(cls, shards: Sequence[Solution]) -> Solution:
+        """Returns the solution of all problems, of those of their shards in order."""
+        return cls(
+            torch.cat([shard.best for shard in shards]),
+            torch.cat([shard.loss for shard in shards]),
+            torch.cat([shard.filling for shard in shards]),
+            torch.cat([shard.diverged for shard in shards]),
+        )
+
     @property
     def sensitivity(self) -> Tensor:
         """Sensitivity of the loss to the parameters, `(P,)`, in the unit of the loss.
@@ -100,8 +110,8 @@ class Solution:
 class Optimizer(Component):
     """Base of every optimizer.
 
-    Life cycle: calibration calls `minimize` once per group of problems. `minimize` cuts the group
-    into chunks that respect the memory bound, calls `solve` for each, checks what comes back and
+    Life cycle: calibration calls `minimize` once per set of problems. `minimize` cuts the set
+    into shards that respect the memory bound, calls `solve` for each, checks what comes back and
     reduces it to a `Solution`. A subclass implements `solve`, `evaluations` and
     `bytes_per_problem`. It keeps no state between calls. The result of a problem must not depend on
     which other problems stand beside it, beyond rounding.
@@ -110,25 +120,25 @@ class Optimizer(Component):
 
     kind = "optimizer"
     in_threads: ClassVar[bool] = False
-    """`solve` may be called for several chunks at once, in threads of one process: how problems are
-    cut into chunks changes no bit, and a cluster cuts them further."""
-    in_parts: ClassVar[bool] = False
-    """Groups of whole trajectories are cut into the same parts on every engine, so that the workers
-    of a cluster share them: for an optimizer whose last bits depend on how problems are cut. One
-    with neither solves a group as a whole."""
+    """`solve` may be called for several shards at once, in threads of one process: how problems are
+    cut into shards changes no bit, and a cluster cuts them further."""
+    in_shards: ClassVar[bool] = False
+    """Whole trajectories that are calibrated together are cut into the same shards on every engine,
+    so that the workers of a cluster share them: for an optimizer whose last bits depend on how
+    problems are cut. One with neither solves all together."""
 
     @abstractmethod
     def solve(
         self, objective: CandidateLosses, guesses: Tensor, *, seed: int
     ) -> tuple[Tried, Tensor]:
-        """Evaluates candidates of all problems of one chunk.
+        """Evaluates candidates of all problems of one shard.
 
         Args:
             objective: returns the losses of candidates within [0, 1]: finite or infinity, never
                 NaN. It counts evaluations.
             guesses: `(P, g, n)` in unit space, g >= 1: candidates to evaluate first; they count as
                 evaluations.
-            seed: the same for every chunk; 0 is a seed like any other.
+            seed: the same for every shard; 0 is a seed like any other.
 
         Returns:
             Candidates `(P, e, n)` and their losses `(P, e)` in the order of evaluation. Candidates
@@ -179,7 +189,7 @@ class Optimizer(Component):
             guesses: `(P, g, n)` in unit space, g >= 1.
             seed: the same seed gives the same result.
             objective_bytes: memory that the loss of one candidate of one problem needs.
-            memory: bound in bytes for one chunk; a chunk holds at least one problem.
+            memory: bound in bytes for one shard; a shard holds at least one problem.
             progress: called with the number of evaluations done since the last call.
             tolerance: losses this close to the lowest, in their unit, count as equal besides those
                 that rounding makes equal.
@@ -195,52 +205,56 @@ class Optimizer(Component):
         require_memory(
             each, f"an optimizer with {self.evaluations():,} evaluations of each problem"
         )
-        chunks_at_once = cores() if self.in_threads else 1
-        chunk = max(1, min(problems, memory // (each * chunks_at_once)))
+        shards_at_once = 1
+        if self.in_threads:
+            shards_at_once = cores()
+        size = max(1, min(problems, memory // (each * shards_at_once)))
         if guesses.device.type == "cpu":
-            chunk = min(chunk, max(1, _LOSSES_AT_ONCE // self.evaluations()))
+            size = min(size, max(1, _LOSSES_AT_ONCE // self.evaluations()))
         guesses = guesses.double().clamp(0.0, 1.0)
         ended = Event()
 
-        def solved(first: int) -> tuple[Tensor, ...]:
-            last = min(first + chunk, problems)
-            own, origin = guesses[first:last], registry.origin(self)
-            losses = _CheckedLosses(objective.select(first, last), progress, n, origin, ended)
-            tried, found = self.solve(losses, own, seed=seed)
+        def solved(first: int) -> Solution:
+            last = min(first + size, problems)
+            guesses_of_shard, origin = guesses[first:last], registry.origin(self)
+            checked = _CheckedLosses(objective.select(first, last), progress, n, origin, ended)
+            tried, losses = self.solve(checked, guesses_of_shard, seed=seed)
             blocks = tried if isinstance(tried, tuple) else (tried,)
-            self._check(blocks, found, own)
-            return _reduce(blocks, found, own, self.space_filling(), tolerance)
+            self._check(blocks, losses, guesses_of_shard)
+            return _reduce(blocks, losses, guesses_of_shard, self.space_filling(), tolerance)
 
-        starts = range(0, problems, chunk)
+        starts = range(0, problems, size)
         try:
             if self.in_threads and guesses.device.type == "cpu" and len(starts) > 1:
-                pieces = share(solved, starts, level="chunks")
+                shards = share(solved, starts, level="shards")
             else:
-                pieces = [solved(first) for first in starts]
+                shards = [solved(first) for first in starts]
         finally:
             ended.set()  # one thread failed, or a signal came: stop the others
-        best, loss, filling, diverged = (torch.cat(parts) for parts in zip(*pieces, strict=True))
-        return Solution(best, loss, filling, diverged)
+        return Solution.joined(shards)
 
     def _check(self, blocks: tuple[Tensor, ...], losses: Tensor, guesses: Tensor) -> None:
         problems, _, n = guesses.shape
         expected = (problems, self.evaluations())
-        evaluations = sum(block.shape[1] for block in blocks)
-        shapes = {(block.shape[0], evaluations, *block.shape[2:]) for block in blocks}
+        evaluations, shapes, dtypes = 0, set(), {losses.dtype}
+        for block in blocks:
+            evaluations += block.shape[1]
+            dtypes.add(block.dtype)
+        for block in blocks:
+            shapes.add((block.shape[0], evaluations, *block.shape[2:]))
         if losses.shape != expected or shapes != {(*expected, n)}:
+            returned = ", ".join(str(tuple(block.shape)) for block in blocks)
             raise PluginError(
                 f"{registry.origin(self)}: solve must return candidates {(*expected, n)} and losses"
-                f" {expected} as evaluations() says, but returned"
-                f" {', '.join(str(tuple(block.shape)) for block in blocks)} and"
+                f" {expected} as evaluations() says, but returned {returned} and"
                 f" {tuple(losses.shape)}"
             )
-        dtypes = {losses.dtype, *[block.dtype for block in blocks]}
         if dtypes != {torch.float64}:
             raise PluginError(
                 f"{registry.origin(self)}: solve must return float64, but returned candidates in"
                 f" {blocks[0].dtype} and losses in {losses.dtype}"
             )
-        if bool(losses.isnan().any()) or not all(_in_unit_space(block) for block in blocks):
+        if bool(losses.isnan().any()) or not all(map(_in_unit_space, blocks)):
             raise PluginError(
                 f"{registry.origin(self)}: solve must return candidates within [0, 1] and losses"
                 " that are numbers or infinity, but returned NaN or a candidate outside"
@@ -253,22 +267,36 @@ def _reduce(
     guesses: Tensor,
     space_filling: int,
     tolerance: float,
-) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Reduces a chunk to best `(P, n)`, loss `(P,)`, filling `(P, 3)` and diverged `(P,)`."""
+) -> Solution:
+    """Reduces the evaluations of a shard to its solution.
+
+    Args:
+        blocks: candidates, as an optimizer returned them.
+        losses: of all of them, `(P, e)`.
+        guesses: `(P, g, n)`.
+        space_filling: how many first evaluations were chosen without looking at losses.
+        tolerance: losses this close to the lowest are equal.
+    """
     g = guesses.shape[1]
     finite = losses.isfinite()
     lowest = losses.amin(dim=1, keepdim=True)
     ties = finite & (losses <= lowest + tolerance + TIE_ABSOLUTE + TIE_RELATIVE * lowest.abs())
-    distance = torch.cat([_squared_distance(block, guesses[:, 0]) for block in blocks], dim=1)
+    distances = []
+    for block in blocks:
+        distances.append(_squared_distance(block, guesses[:, 0]))
+    distance = torch.cat(distances, dim=1)
+    # Among candidates that tie, the nearest to the first guess: what the recording does not tell
+    # apart stays where it was expected.
     index = distance.where(ties, torch.inf).argmin(dim=1)
     best = _at(blocks, index)
-    some = finite.any(dim=1)
-    best = best.where(some[:, None], guesses[:, 0])
-    loss = losses.gather(1, index[:, None]).squeeze(1).where(some, torch.inf)
-    # Where all space-filling evaluations are guesses, the guesses count.
-    first = g if space_filling > g else 0
+    any_finite = finite.any(dim=1)
+    best = best.where(any_finite[:, None], guesses[:, 0])
+    loss = losses.gather(1, index[:, None]).squeeze(1).where(any_finite, torch.inf)
+    first = g
+    if space_filling <= g:
+        first = 0  # all space-filling evaluations are guesses, so guesses count
     filling = _low_median_high(losses[:, first:space_filling], finite[:, first:space_filling])
-    return best, loss, filling, (~finite).sum(dim=1)
+    return Solution(best, loss, filling, (~finite).sum(dim=1))
 
 
 def _low_median_high(losses: Tensor, finite: Tensor) -> Tensor:
@@ -345,7 +373,7 @@ class _CheckedLosses:
                 f"{self.optimizer}: it asked for a candidate outside the bounds [0, 1] of unit"
                 " space"
             )
-        found = [candidates.new_empty((self.problems, 0))]
+        of_blocks = [candidates.new_empty((self.problems, 0))]
         for block in torch.split(candidates, AT_ONCE, dim=1):
             if block.shape[1] == 0:
                 continue
@@ -353,8 +381,8 @@ class _CheckedLosses:
             self.progress(losses.numel())
             if not bool(losses.sum().isfinite()):
                 losses = losses.nan_to_num(nan=torch.inf, posinf=torch.inf, neginf=torch.inf)
-            found.append(losses)
-        return torch.cat(found, dim=1)
+            of_blocks.append(losses)
+        return torch.cat(of_blocks, dim=1)
 
     def select(self, first: int, last: int) -> CandidateLosses:
         return replace(self, objective=self.objective.select(first, last))
@@ -373,12 +401,12 @@ def check_room(evaluations: int, guesses: int, *, key: str) -> None:
         )
 
 
-def sobol(count: int, n: int, *, seed: int, like: Tensor) -> Tensor:
-    """Returns scrambled Sobol points `(count, n)` within [0, 1], float64, on `like`'s device."""
+def sobol(count: int, n: int, *, seed: int, device: torch.device) -> Tensor:
+    """Returns scrambled Sobol points `(count, n)` within [0, 1], float64."""
     if count == 0:
-        return like.new_empty((0, n))
+        return torch.empty((0, n), dtype=torch.float64, device=device)
     # torch leaves the engine untyped.
     make: Any = torch.quasirandom.SobolEngine
     engine = make(n, scramble=True, seed=seed)
     points: Tensor = engine.draw(count, dtype=torch.float64)
-    return points.to(like.device)
+    return points.to(device)

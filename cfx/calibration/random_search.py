@@ -56,7 +56,7 @@ class RandomSearch(Optimizer):
     ) -> tuple[Tried, Tensor]:
         problems, g, n = guesses.shape
         check_room(self.settings.samples, g, key="samples")
-        points = sobol(self.settings.samples - g, n, seed=seed, like=guesses)
+        points = sobol(self.settings.samples - g, n, seed=seed, device=guesses.device)
         blocks = (guesses, points.expand(problems, -1, -1))
         losses = torch.cat([objective(guesses), objective(blocks[1])], dim=1)
         return blocks, losses

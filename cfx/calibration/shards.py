@@ -8,7 +8,6 @@ Shapes: P pairs of a shard, T frames of the longest, W windows, K groups, n tune
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -31,12 +30,12 @@ from cfx.simulation.base import Stepper
 _SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
 """Tolerance for a loss that is computed again: other batches of candidates round differently."""
 
-_WAY = (1.0, 0.9, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01, 0.0)
-"""Parts of the way from where a search ended to the default that are tried at once; with the last
-one it stays."""
+_STEPS_TOWARDS_DEFAULT = (1.0, 0.9, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01, 0.0)
+"""Line search along one parameter, from the search's end point to the model's default: 1 is the
+default, 0 the end point. All are evaluated in one batch; the lowest loss plus prior wins."""
 
-_SETTLING_ROUNDS = 6
-"""Most passes over each parameter."""
+_LINE_SEARCHES = 6
+"""Most line searches along each parameter (coordinate descent; it ends when none moves)."""
 
 
 @dataclass(frozen=True)
@@ -44,16 +43,16 @@ class Solver:
     """The model, optimizer and objective that all problems of a calibration share.
 
     Attributes:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         optimizer: solves the problems.
         seed: the same seed gives the same parameters.
         objective: what is minimised.
-        memory: bound for one chunk, bytes.
+        memory: bound for one shard, bytes.
         prior: weight of the prior on driver-specific and pooled parameters
             (`cfx.calibration.losses`); 0: none. Labels have none: ties go to the driver's own set.
     """
 
-    simulator: Stepper
+    stepper: Stepper
     optimizer: Optimizer
     seed: int
     objective: Objective = field(default_factory=SpeedRmse)
@@ -63,13 +62,13 @@ class Solver:
     @property
     def space(self) -> ParameterSpace:
         """The model's parameter space."""
-        return self.simulator.model.space
+        return self.stepper.model.space
 
     def segments(
         self, batch: PairBatch, pair: Tensor, first: Tensor, steps: Tensor
     ) -> SegmentLosses:
         """Returns the losses of segments of pairs; see `SegmentLosses.of_segments`."""
-        return SegmentLosses.of_segments(self.simulator, self.objective, batch, pair, first, steps)
+        return SegmentLosses.of_segments(self.stepper, self.objective, batch, pair, first, steps)
 
     def has_kernel(self, batch: PairBatch) -> bool:
         """Says whether losses come from a compiled kernel where these pairs are."""
@@ -79,11 +78,11 @@ class Solver:
     @property
     def scope(self) -> dict[str, Any]:
         """Everything but the trajectories that results depend on, for keys of the cache."""
-        model = self.simulator.model
+        model = self.stepper.model
         parameters = [(p.name, p.low, p.high, p.default, p.tuned) for p in self.space]
         return {
-            "dt": self.simulator.dt,
-            "simulation": self.simulator.identity(),
+            "dt": self.stepper.dt,
+            "simulation": self.stepper.identity(),
             "calibration": folder_hash(__file__),
             "model": model.identity(),
             "parameters": parameters,
@@ -147,30 +146,33 @@ class Solver:
 
         A search stops at what it has tried. Where a parameter hardly matters, the prior alone
         says where it belongs, and its slope is too small for a search among steep ones. So each
-        parameter in turn goes some part of the way to its default, as far as that is better.
+        parameter in turn goes towards its default, as far as that is better.
         """
-        at_once = max(1, self.memory // (losses.bytes_per_candidate * len(_WAY)))
-        worked = losses.for_work(self.optimizer.evaluations())
-        parts = []
-        for first in range(0, len(best), at_once):
-            last = min(first + at_once, len(best))
-            parts.append(_towards(default, worked.select(first, last), best[first:last]))
-        return torch.cat(parts)
+        size = max(1, self.memory // (losses.bytes_per_candidate * len(_STEPS_TOWARDS_DEFAULT)))
+        # Whether a kernel pays is asked for as much work as the search was, so that losses have
+        # the bits that they had there.
+        same_losses = losses.for_work(self.optimizer.evaluations())
+        settled = []
+        for first in range(0, len(best), size):
+            last = min(first + size, len(best))
+            shard = same_losses.select(first, last)
+            settled.append(_towards(default, shard, best[first:last]))
+        return torch.cat(settled)
 
     def _check_losses(self, losses: SegmentLosses | PooledLosses, solution: Solution) -> None:
         """Refuses a third party's optimizer that has mixed up its candidates."""
         if registry.is_own(self.optimizer):
             return
-        again, found = losses(solution.best[:, None])[:, 0], solution.loss
-        both = again.isfinite() & found.isfinite()
-        same = torch.isclose(again, found, rtol=_SAME_RELATIVE, atol=_SAME_ABSOLUTE)
+        again, returned = losses(solution.best[:, None])[:, 0], solution.loss
+        both = again.isfinite() & returned.isfinite()
+        same = torch.isclose(again, returned, rtol=_SAME_RELATIVE, atol=_SAME_ABSOLUTE)
         wrong = both & ~same
         if bool(wrong.any()):
             at = int(wrong.nonzero()[0])
             raise PluginError(
                 f"{registry.origin(self.optimizer)}: solve returned candidates with losses that are"
-                f" not theirs: {float(found[at]):.6g} where the candidate has"
-                f" {float(again[at]):.6g} ({int(wrong.sum())} of {len(found)} problems)"
+                f" not theirs: {float(returned[at]):.6g} where the candidate has"
+                f" {float(again[at]):.6g} ({int(wrong.sum())} of {len(returned)} problems)"
             )
 
 
@@ -215,11 +217,11 @@ class CalibrationShard:
         """Returns what is minimised, with the guesses and the tolerance of `Solver.minimize`."""
         raise NotImplementedError
 
-    def entries(self, found: Arrays) -> list[Arrays]:
-        """Returns an entry of the cache for each of what was asked for: here for each problem."""
+    def entries(self, solution: Arrays) -> list[Arrays]:
+        """Returns the entries of the cache that a solution is kept in: one for each problem."""
         entries = []
-        for number in range(len(found["loss"])):
-            entries.append({name: values[number] for name, values in found.items()})
+        for number in range(len(solution["loss"])):
+            entries.append({name: values[number] for name, values in solution.items()})
         return entries
 
 
@@ -245,16 +247,19 @@ class SegmentShard(CalibrationShard):
 
     def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
         losses = self.solver.segments(self.batch, self.pair, self.first, self.steps)
-        guesses = None if self.guesses is None else self.guesses[self.pair]
+        guesses = self.guesses
+        if guesses is not None:
+            guesses = guesses[self.pair]
         return losses, guesses, self.tolerance
 
-    def entries(self, found: Arrays) -> list[Arrays]:
+    def entries(self, solution: Arrays) -> list[Arrays]:
         if self.counts is None:
-            return super().entries(found)
-        entries = []
-        for last, count in zip(itertools.accumulate(self.counts), self.counts, strict=True):
-            own = slice(last - count, last)
-            entries.append({name: values[own] for name, values in found.items()})
+            return super().entries(solution)
+        entries, first = [], 0
+        for count in self.counts:
+            segments = slice(first, first + count)
+            entries.append({name: values[segments] for name, values in solution.items()})
+            first += count
         return entries
 
 
@@ -271,23 +276,24 @@ class PooledShard(CalibrationShard):
     members: Tensor
 
     def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
-        simulator, objective = self.solver.simulator, self.solver.objective
-        trajectories = FullTrajectories(simulator, objective, self.batch, self.last)
+        stepper, objective = self.solver.stepper, self.solver.objective
+        trajectories = FullTrajectories(stepper, objective, self.batch, self.last)
         return PooledLosses(trajectories, self.members, self.solver.memory), None, 0.0
 
 
 def _towards(default: Tensor, losses: SegmentLosses | PooledLosses, best: Tensor) -> Tensor:
     """Returns `(P, n)` in unit space: see `Solver._settled`."""
-    way = torch.tensor(_WAY, dtype=best.dtype, device=best.device)
+    steps = torch.tensor(_STEPS_TOWARDS_DEFAULT, dtype=best.dtype, device=best.device)
     default, problem = default.to(best), torch.arange(len(best), device=best.device)
     point = best
-    for _ in range(_SETTLING_ROUNDS):
+    for _ in range(_LINE_SEARCHES):
         before = point
         for column in range(best.shape[1]):
-            tried = point[:, None].repeat(1, len(way), 1)
-            tried[..., column] += way * (default[column] - point[:, column, None])
-            index = losses(tried).nan_to_num(nan=torch.inf).argmin(dim=1)
-            point = tried[problem, index]
+            # (P, n) -> (P, steps, n): the same point, but for one parameter.
+            candidates = point[:, None].repeat(1, len(steps), 1)
+            candidates[..., column] += steps * (default[column] - point[:, column, None])
+            index = losses(candidates).nan_to_num(nan=torch.inf).argmin(dim=1)
+            point = candidates[problem, index]
         if torch.equal(point, before):
             break
     return point

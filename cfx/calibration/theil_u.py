@@ -13,12 +13,12 @@ from cfx.core.component import Settings
 
 
 class TheilUSettings(Settings):
-    """Settings of `TheilU`."""
+    """Settings of `TheilInequality`."""
 
     signal: Signal = Field("speed", description="what is compared: speed or gap")
 
 
-class TheilU(Objective):
+class TheilInequality(Objective):
     """Theil's U: an error between 0 (perfect) and 1, without unit.
 
     The root mean squared error, divided by the sum of the root mean squares of the simulated and of

@@ -44,7 +44,7 @@ _SET_BY_LIBRARIES = (
 )
 """Variables of the environment that libraries set as they are imported, and PyTorch's compiler."""
 
-_Part = tuple[Callable[[], Any], Callable[[Any], object]]
+_Restorable = tuple[Callable[[], Any], Callable[[Any], object]]
 """How a part of the state is read, and how it is put back."""
 
 
@@ -57,7 +57,7 @@ def guest() -> Iterator[None]:
     of cores, MLflow's tracking URI. MLflow's autologging rests meanwhile: training is no run of the
     caller's.
     """
-    with _put_back(_parts()), warnings.catch_warnings(), no_autologging():
+    with _put_back(_restorables()), warnings.catch_warnings(), no_autologging():
         yield
 
 
@@ -72,7 +72,7 @@ def in_turn() -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def _put_back(parts: Iterator[_Part]) -> Iterator[None]:
+def _put_back(parts: Iterator[_Restorable]) -> Iterator[None]:
     """Puts parts of the state back after the block, the last one first."""
     before = [(put_back, read()) for read, put_back in parts]
     try:
@@ -134,7 +134,7 @@ def visit() -> Iterator[None]:
 
     from cfx.core.progress import no_bars_on_terminals
 
-    parts: list[_Part] = [
+    parts: list[_Restorable] = [
         (cores_limit, limit_cores),
         _if_changed(torch.get_num_threads, torch.set_num_threads),
     ]
@@ -148,7 +148,7 @@ def visit() -> Iterator[None]:
         yield
 
 
-def _parts() -> Iterator[_Part]:
+def _restorables() -> Iterator[_Restorable]:
     """Yields the parts of the state; later ones are put back first."""
     yield os.environ.copy, _put_environment
     yield Path.cwd, _put_directory
@@ -158,7 +158,7 @@ def _parts() -> Iterator[_Part]:
     yield _logging, _put_logging
     torch = sys.modules.get("torch")
     if torch is not None:
-        yield from _torch_parts(torch)
+        yield from _torch_restorables(torch)
     mlflow = sys.modules.get("mlflow")
     if mlflow is not None:  # after the environment, one of whose variables it is too
         yield _if_changed(
@@ -167,7 +167,7 @@ def _parts() -> Iterator[_Part]:
         )
 
 
-def _torch_parts(torch: Any) -> Iterator[_Part]:
+def _torch_restorables(torch: Any) -> Iterator[_Restorable]:
     yield torch.get_num_threads, torch.set_num_threads
     yield torch.get_default_dtype, torch.set_default_dtype
     yield torch.is_grad_enabled, torch.set_grad_enabled
@@ -184,7 +184,7 @@ def _torch_parts(torch: Any) -> Iterator[_Part]:
         yield partial(getattr, cudnn, flag), partial(setattr, cudnn, flag)
 
 
-def _if_changed(read: Callable[[], Any], put_back: Callable[[Any], object]) -> _Part:
+def _if_changed(read: Callable[[], Any], put_back: Callable[[Any], object]) -> _Restorable:
     """Returns a part that is put back only where it has changed."""
 
     def put(value: Any) -> None:

@@ -145,7 +145,7 @@ KINDS: dict[str, Kind] = {
 }
 """All kinds, by name."""
 
-PARTS: dict[str, Kind] = {
+SIMPLE_KINDS: dict[str, Kind] = {
     kind.name: kind
     for kind in (
         Kind("figure", "cfx.results.figure:JobFigure", chosen=False),
@@ -221,7 +221,7 @@ def every_kind() -> dict[str, Kind]:
 
     Those of other distributions come last. Imports nothing.
     """
-    return {**KINDS, **PARTS, **_kinds_of_plugins(_search_path())}
+    return {**KINDS, **SIMPLE_KINDS, **_kinds_of_plugins(_search_path())}
 
 
 @functools.lru_cache(maxsize=1)
@@ -229,7 +229,7 @@ def _kinds_of_plugins(search_path: tuple[tuple[str, float], ...]) -> dict[str, K
     """Returns the kinds that other distributions announce: an entry point is a base class each."""
     kinds = {}
     for announced in _announced(search_path).get(KINDS_GROUP, ()):
-        if announced.name not in KINDS and announced.name not in PARTS:
+        if announced.name not in KINDS and announced.name not in SIMPLE_KINDS:
             kinds[announced.name] = Kind(announced.name, announced.target, chosen=False)
     return kinds
 
@@ -403,13 +403,13 @@ class Installed(Generic[T]):
     Attributes:
         kind: such as "figure".
         name: of its entry point.
-        part: what it is.
+        component: what it is.
         distribution: who brings it.
     """
 
     kind: str
     name: str
-    part: T
+    component: T
     distribution: str
 
     def attempt(self, work: Callable[[T], R], without: R) -> R:
@@ -419,7 +419,7 @@ class Installed(Generic[T]):
         returned: the job has its results.
         """
         try:
-            return work(self.part)
+            return work(self.component)
         except Exception as error:
             if self.distribution == OWN:
                 raise
@@ -478,14 +478,14 @@ def _installed(
             _warn_of_left_out(announced, f"{others[0].distribution} brings one of that name")
             continue
         try:
-            part: Any = create(kind, {"name": announced.name})
+            component: Any = create(kind, {"name": announced.name})
         except PluginError as error:
             if announced.distribution == OWN:
                 raise
             _warn_of_left_out(announced, str(error))
             continue
-        made.append(Installed(kind, announced.name, part, announced.distribution))
-    return tuple(sorted(made, key=lambda one: (one.part.order, one.name)))
+        made.append(Installed(kind, announced.name, component, announced.distribution))
+    return tuple(sorted(made, key=lambda one: (one.component.order, one.name)))
 
 
 def _warn_of_left_out(one: Entry | Installed[Any], reason: str) -> None:
@@ -667,7 +667,7 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[st
     if not ours:
         return
     kinds = {}
-    for about in (*KINDS.values(), *PARTS.values()):
+    for about in (*KINDS.values(), *SIMPLE_KINDS.values()):
         kinds[about.entry_points] = about.name
     metadata = distribution.metadata  # read anew each time that it is asked for
     name, version = metadata["Name"], metadata["Version"]

@@ -271,7 +271,7 @@ class Dataset(Component):
         pairs = with_vehicles(pairs, self.settings.vehicle)
         for name in _NOUNS:
             pairs = _selected(pairs, name, getattr(self.settings, name))
-        recorded = {pair.pair_id: pair for pair in pairs}
+        recorded = dict(zip(of_each(pairs, "pair_id"), pairs, strict=True))
         if self.settings.time_step is not None:
             pairs = resampled(pairs, self.settings.time_step)
             if not len(pairs):
@@ -280,9 +280,11 @@ class Dataset(Component):
                     " two such steps; give a shorter one"
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_duration), self.settings)
-        as_recorded = tuple([recorded[pair.pair_id] for pair in selected.pairs])
+        as_recorded = []
+        for pair in selected.pairs:
+            as_recorded.append(recorded[pair.pair_id])
         verdict = check_pairs(
-            replace(selected, pairs=as_recorded),
+            replace(selected, pairs=tuple(as_recorded)),
             self.settings.check,
             self.units(),
             can_say_units=hasattr(self.settings, "units"),

@@ -21,7 +21,15 @@ from cfx.core.registry import Entry
 from cfx.data.base import Contents, Dataset, rounded_down
 from cfx.data.check import Check, judge
 from cfx.data.files import Floats, Ints, beginning, has_letters, partitions
-from cfx.data.pairs import Dropped, Pair, PairSet, driver_names, of_each, over_frames
+from cfx.data.pairs import (
+    Dropped,
+    Pair,
+    PairSet,
+    driver_names,
+    frames_of_each,
+    of_each,
+    over_frames,
+)
 from cfx.data.plausible import doubts, rare
 from cfx.data.resampling import frames_in_steps
 from cfx.data.style import (
@@ -230,8 +238,9 @@ def _table(*headings: str, title: str | None = None, right: int = 2, left: int =
         right, left: blanks beside a column.
     """
     table = Table(title=title, title_justify="left", box=None, padding=(0, right, 0, left))
-    for number, heading in enumerate(headings):
-        table.add_column(heading, justify="right" if number else "left")
+    for heading in headings:
+        table.add_column(heading, justify="right")
+    table.columns[0].justify = "left"
     return table
 
 
@@ -450,7 +459,7 @@ def _quantities(pairs: PairSet) -> Iterator[tuple[str, Floats]]:
     gap = over_frames(pairs, "gap")
     headway = over_frames(pairs, "leader_position") - over_frames(pairs, "follower_position")
     moving = speed >= STANDING_MPS
-    yield "frames", np.array([len(pair) for pair in pairs], dtype=np.float64)
+    yield "frames", np.array(frames_of_each(pairs), dtype=np.float64)
     yield "leader speed, m/s", over_frames(pairs, "leader_speed")
     yield "follower speed, m/s", speed
     yield "follower acceleration, m/s2", over_frames(pairs, "follower_acceleration")

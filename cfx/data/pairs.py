@@ -222,6 +222,11 @@ def of_each(pairs: Iterable[Pair], name: str) -> list[Any]:
     return [getattr(pair, name) for pair in pairs]
 
 
+def frames_of_each(pairs: Iterable[Pair]) -> list[int]:
+    """Returns the number of frames of each pair."""
+    return [len(pair) for pair in pairs]
+
+
 def over_frames(pairs: Iterable[Pair], name: str) -> Array:
     """Returns a signal, or the gap, over the frames of all pairs, one pair after the other."""
     return np.concatenate(of_each(pairs, name))
@@ -329,6 +334,16 @@ class PairSet(Sequence[Pair]):
                 raise DataError(f"{self.source}: pair id '{pair.pair_id}' stands for two pairs")
             seen.add(pair.pair_id)
 
+    @property
+    def ids(self) -> list[str]:
+        """The name of each pair."""
+        return [pair.pair_id for pair in self.pairs]
+
+    @property
+    def drivers(self) -> list[str]:
+        """The driver of each pair: several pairs may have the same."""
+        return [pair.driver for pair in self.pairs]
+
     def __len__(self) -> int:
         return len(self.pairs)
 
@@ -343,7 +358,7 @@ class PairSet(Sequence[Pair]):
     @property
     def frames(self) -> int:
         """The number of frames of all pairs."""
-        return sum(len(pair) for pair in self.pairs)
+        return sum(frames_of_each(self.pairs))
 
     @property
     def size(self) -> int:
@@ -509,7 +524,7 @@ class PairBatch:
         if not isinstance(pairs, PairSet):
             pairs = PairSet(tuple(pairs), "pairs")
         dt, dtype = pairs.dt, dtype or torch.float64
-        lengths = torch.tensor([len(pair) for pair in pairs.pairs])
+        lengths = torch.tensor(frames_of_each(pairs.pairs))
         length = max(frames, int(lengths.max()))
         shape = (len(pairs), length)
         signals = {}

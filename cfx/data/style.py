@@ -25,7 +25,7 @@ from pydantic import Field, model_validator
 
 from cfx.core import memory
 from cfx.core.component import Settings
-from cfx.data.pairs import Pair, PairSet, of_each, over_frames
+from cfx.data.pairs import Pair, PairSet, frames_of_each, of_each, over_frames
 from cfx.errors import DataError
 
 if TYPE_CHECKING:
@@ -66,6 +66,10 @@ INDICATORS = (
     Indicator("mean_time_headway", -1, "s"),
 )
 """What a driver's style is scored by: columns of the evaluation matrix, in their order."""
+
+
+INDICATOR_NAMES = [indicator.name for indicator in INDICATORS]
+"""Their names."""
 
 
 def name_of_indicator(name: str) -> str:
@@ -145,8 +149,7 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
     if not len(pairs):
         raise DataError(f"{pairs.source}: no pairs, so no driving style to measure")
     table = indicators(pairs)
-    names = [indicator.name for indicator in INDICATORS]
-    raw = table[names].to_numpy(dtype=np.float64)
+    raw = table[INDICATOR_NAMES].to_numpy(dtype=np.float64)
     normalised = normalise(raw, settings.direction)
     weights = entropy_weights(normalised)
     score = (normalised * weights).sum(axis=1)
@@ -160,7 +163,7 @@ def measure_style(pairs: PairSet, settings: StyleSettings) -> StyleResult:
         has_sites |= bool(pair.site)
     if has_sites:
         table["site"], table["driver_type"] = _whereabouts(pairs, table["driver"].tolist())
-    by_name = dict(zip(names, weights.tolist(), strict=True))
+    by_name = dict(zip(INDICATOR_NAMES, weights.tolist(), strict=True))
     return StyleResult(table, by_name, (float(low), float(high)))
 
 
@@ -236,9 +239,8 @@ def _indicators(pairs: Sequence[Pair]) -> pd.DataFrame:
     """Returns the indicators of drivers all of whose pairs are given."""
     import pandas as pd
 
-    sizes = [len(pair) for pair in pairs]
     code, drivers = pd.factorize(np.array(of_each(pairs, "driver"), dtype=object))
-    code = np.repeat(code, sizes)
+    code = np.repeat(code, frames_of_each(pairs))
     speed = over_frames(pairs, "follower_speed")
     acceleration = over_frames(pairs, "follower_acceleration")
     space = over_frames(pairs, "leader_position") - over_frames(pairs, "follower_position")
@@ -443,9 +445,8 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
     import pandas as pd
     from scipy import stats  # slow to import: only where there is something to compare
 
-    names = [indicator.name for indicator in INDICATORS]
-    scaled = normalise(style.table[names].to_numpy(dtype=np.float64))
-    weighted = scaled * np.array([style.weights[name] for name in names])
+    scaled = normalise(style.table[INDICATOR_NAMES].to_numpy(dtype=np.float64))
+    weighted = scaled * np.array([style.weights[name] for name in INDICATOR_NAMES])
     score = style.table["score"].to_numpy(dtype=np.float64)
     rows: list[dict[str, object]] = []
     for group, other in compared:

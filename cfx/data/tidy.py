@@ -62,7 +62,7 @@ from cfx.data.files import (
     partitions,
     recording_of,
 )
-from cfx.data.pairs import Dropped, Pair, PairSet, of_each
+from cfx.data.pairs import Dropped, Pair, PairSet, frames_of_each, of_each
 from cfx.data.signals import RECORDED, SIGNALS, Signal, declared_by, further_signals
 from cfx.data.table import FileColumn, Layout, Table, read_table, table_of
 from cfx.data.tidy_checks import GAP, LANE, LENGTH, TRUE, check, check_gap, time_steps
@@ -447,7 +447,7 @@ def _build(table: Table, order: Ints, starts: Ints, signals: Sequence[Signal]) -
     ends = np.append(starts[1:], len(order))
     pairs = []
     for start, end, step in zip(starts.tolist(), ends.tolist(), steps.tolist(), strict=True):
-        label = {name: labels.at(int(order[start])) for name, labels in table.labels.items()}
+        row = int(order[start])
         truth = {}
         for name in numbers:
             if name.startswith(TRUE) and not np.isnan(numbers[name][start]):
@@ -455,9 +455,12 @@ def _build(table: Table, order: Ints, starts: Ints, signals: Sequence[Signal]) -
         lane = None
         if LANE in numbers and not np.isnan(numbers[LANE][start]):
             lane = int(numbers[LANE][start])
-        fields: dict[str, Any] = {name: label[name] for name in LABELS}
+        fields: dict[str, Any] = {}
+        for name in LABELS:
+            fields[name] = table.labels[name].at(row)
         for name, attribute in OPTIONAL_LABELS.items():
-            fields[attribute] = label.get(name, "")
+            if name in table.labels:
+                fields[attribute] = table.labels[name].at(row)
         for name in RECORDED:
             fields[name] = numbers[SIGNALS[name].column][start:end]
         surroundings = {}
@@ -570,8 +573,7 @@ def _as_table(
     signals: Sequence[Signal],
 ) -> Any:
     """Returns pairs as an Arrow table with some of the optional columns and further signals."""
-    sizes = [len(pair) for pair in pairs]
-    pair_of_row = pa.array(np.repeat(np.arange(len(sizes)), sizes))
+    pair_of_row = pa.array(np.repeat(np.arange(len(pairs)), frames_of_each(pairs)))
 
     def per_pair(values: Sequence[Any], kind: Any) -> Any:
         return pa.array(values, kind).take(pair_of_row)

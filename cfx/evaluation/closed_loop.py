@@ -102,7 +102,7 @@ class ClosedLoop(NamedTuple):
 @torch.no_grad()
 @one_thread()
 def simulate_closed_loop(
-    simulator: Stepper,
+    stepper: Stepper,
     agent: Agent,
     followers: Followers,
     first: Tensor,
@@ -113,7 +113,7 @@ def simulate_closed_loop(
     """Simulates the test part of P pairs with an agent in the loop.
 
     Args:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         agent: chooses the parameters of each window.
         followers: P pairs, simulated to the end of the longest, and what the agent knows of them.
         first: `(P,)`, the frame of the last measured state.
@@ -121,15 +121,15 @@ def simulate_closed_loop(
         generator: draws, on the CPU, what a stochastic agent leaves to chance; None: nothing is
             drawn.
     """
-    simulator = agent.stepper(simulator)
-    model = simulator.model
+    stepper = agent.stepper(stepper)
+    model = stepper.model
     if followers.own is not None:
-        simulator = simulator.for_model(Combined(model, model))
+        stepper = stepper.for_model(Combined(model, model))
     if state is None:
-        state = burnt_in(agent, followers, first, simulator.dt)
+        state = burnt_in(agent, followers, first, stepper.dt)
     track = _Track(followers.batch, first, agent.windows.length)
     position, speed, acceleration = track.now()
-    follower = simulator.begin(Start(position, speed, acceleration))
+    follower = stepper.begin(Start(position, speed, acceleration))
     width = len(agent.core.head.model_space)
     parameters = track.speed.new_empty((len(first), track.steps + 1, width))
     outside = torch.zeros(parameters.shape[:2], dtype=torch.bool, device=parameters.device)
@@ -144,8 +144,8 @@ def simulate_closed_loop(
         p = agent.space.unpack(chosen)
         if followers.own is not None:
             p = for_both(p, own, followers.own.weight)
-        follower, positions, speeds = simulator.advance(follower, track.leader(begin, end), p)
-        track.write(begin, end, positions.T, speeds.T, simulator.dt)
+        follower, positions, speeds = stepper.advance(follower, track.leader(begin, end), p)
+        track.write(begin, end, positions.T, speeds.T, stepper.dt)
         simulated = slice(begin + 1, end + 1)
         parameters[:, simulated] = chosen[:, None, :width]
         is_outside = state.score > 1.0
@@ -155,7 +155,7 @@ def simulate_closed_loop(
         if begin == 0:
             parameters[:, 0] = chosen[:, :width]
     speed, gap, counted = track.result()
-    at_limit = at_limits(simulator.model.limits, speed, simulator.dt)
+    at_limit = at_limits(stepper.model.limits, speed, stepper.dt)
     return ClosedLoop(speed, gap, parameters, counted, at_limit, outside, beyond)
 
 
@@ -294,7 +294,7 @@ _TENSORS = 12
 class ClosedLoopShard:
     """Some pairs, and what drives them: the arguments of `simulate_closed_loop`."""
 
-    simulator: Stepper
+    stepper: Stepper
     agent: Agent
     followers: Followers
     first: Tensor
@@ -302,12 +302,12 @@ class ClosedLoopShard:
 
 def simulate_shard(shard: ClosedLoopShard, _report: Report) -> ClosedLoop:
     """Simulates the pairs of a shard, wherever it is; nobody is shown the progress of seconds."""
-    return simulate_closed_loop(shard.simulator, shard.agent, shard.followers, shard.first)
+    return simulate_closed_loop(shard.stepper, shard.agent, shard.followers, shard.first)
 
 
 def simulate_in_shards(
     engine: Engine,
-    simulator: Stepper,
+    stepper: Stepper,
     agent: Agent,
     followers: Followers,
     first: Tensor,
@@ -318,15 +318,15 @@ def simulate_in_shards(
 
     Args:
         engine: where shards are simulated; few pairs are simulated here.
-        simulator, agent, followers, first: as for `simulate_closed_loop`.
+        stepper, agent, followers, first: as for `simulate_closed_loop`.
     """
     # What it has learned from is a long list, and drives nothing.
     agent = replace(agent, trained_on=TrainedOn())
     batch = followers.batch
     if len(batch) <= PAIRS_AT_ONCE:
-        return simulate_closed_loop(simulator, agent, followers, first)
+        return simulate_closed_loop(stepper, agent, followers, first)
     joined = _Joined(len(batch), 1 + int((batch.lengths - 1 - first).max()))
-    shards = _cut(ClosedLoopShard(simulator, agent, followers, first))
+    shards = _cut(ClosedLoopShard(stepper, agent, followers, first))
     with closing(engine.map(simulate_shard, shards, lambda _: None)) as results:
         for number, part in results:
             joined.put(number, part)
@@ -347,7 +347,7 @@ def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
             base = followers.base[part]
         own = None if followers.own is None else followers.own[part]
         some = Followers(followers.batch[part].trimmed(), network, base, followers.history, own)
-        yield ClosedLoopShard(whole.simulator, agent, some, whole.first[part])
+        yield ClosedLoopShard(whole.stepper, agent, some, whole.first[part])
 
 
 class _Joined:

@@ -194,8 +194,8 @@ def evaluate(
         whole = _rows(full_trajectory, rows)
         measures.add(_scopes(batch[rows], first[rows], _rows(loops, rows), whole, spaces))
     measured, infos, left_out = measures.found()
-    drivers = [pair.driver for pair in pairs]
-    values = long_table([pair.pair_id for pair in pairs], drivers, measured)
+    drivers = pairs.drivers
+    values = long_table(pairs.ids, drivers, measured)
     improvements = {}
     for scope in ("test", "steady", "full_trajectory"):
         of_scope = _improvements(values, scope, drivers)
@@ -362,11 +362,11 @@ def _about(tested: ComparedPairs, measures: _Measures, names: Sequence[str]) -> 
     pairs = tested.pairs
     by_driver = tested.style.table.set_index("driver")
     methods = list(measures.parameters)
-    drivers = [pair.driver for pair in pairs]
+    drivers = pairs.drivers
     clusters = by_driver["cluster"].loc[drivers].map(dict(enumerate(CLUSTERS)))
     folds = np.zeros(len(pairs), np.int64) if tested.fold is None else tested.fold.numpy()
     of_pair = {
-        "pair_id": [pair.pair_id for pair in pairs],
+        "pair_id": pairs.ids,
         "recording": [pair.recording for pair in pairs],
         "leader_id": [pair.leader_id for pair in pairs],
         "follower_id": [pair.follower_id for pair in pairs],

@@ -45,8 +45,8 @@ LeaderFuture = Literal["given", "constant_speed", "constant_acceleration"]
 `constant_acceleration`: what can be known at the origin, if the leader drives on as they do there.
 """
 
-_CHUNK_BYTES = 1 << 28
-"""What one chunk of origins takes at most, for signals and for the state of networks."""
+_SHARD_BYTES = 1 << 28
+"""What one shard of origins takes at most, for signals and for the state of networks."""
 
 _COPIES = 4
 """How many tensors of the networks' state are alive at once, and of the signals besides."""
@@ -82,8 +82,8 @@ class Origins:
     def columns(self, pairs: PairSet) -> dict[str, NDArray[np.object_]]:
         """Returns the columns with which a table of them begins: `pair_id` and `driver`."""
         index = self.pair.cpu().numpy()
-        ids = np.asarray([pair.pair_id for pair in pairs], dtype=object)
-        drivers = np.asarray([pair.driver for pair in pairs], dtype=object)
+        ids = np.asarray(pairs.ids, dtype=object)
+        drivers = np.asarray(pairs.drivers, dtype=object)
         return {"pair_id": ids[index], "driver": drivers[index]}
 
     def __len__(self) -> int:
@@ -127,7 +127,7 @@ def measured_paths(batch: PairBatch, origins: Origins, steps: int) -> tuple[Path
 
 
 def sample_from_origins(
-    simulator: Stepper,
+    stepper: Stepper,
     agent: Agent,
     followers: Followers,
     origins: Origins,
@@ -140,10 +140,10 @@ def sample_from_origins(
 
     Up to an origin the agent observes what was measured (burn-in, driver features), once for all
     paths. From there on it sees the simulated follower only. One path of all origins is one batch,
-    in chunks that fit the memory.
+    in shards that fit the memory.
 
     Args:
-        simulator: the model and its time step.
+        stepper: the model and its time step.
         agent: chooses the parameters of each window; of any kind.
         followers: P pairs, and what the agent knows of them; it observes their history before each
             origin.
@@ -158,20 +158,20 @@ def sample_from_origins(
     """
     speeds, travelled = [], []
     batch, base = followers.batch, followers.base
-    for chunk in _chunks(agent, batch, origins):
+    for shard in _shards(agent, batch, origins):
         state = None
         if followers.history is None and not agent.core.driver_features:
-            state = _observed(agent, followers, chunk)
-        part = _with_future(batch[chunk.pair], chunk.frame, steps, leader)
-        own = None if base is None else base[chunk.pair]
-        known = Followers(part, followers.network[chunk.pair], own, followers.history)
-        index = chunk.frame[:, None] + torch.arange(steps + 1, device=chunk.frame.device)
+            state = _observed(agent, followers, shard)
+        part = _with_future(batch[shard.pair], shard.frame, steps, leader)
+        own = None if base is None else base[shard.pair]
+        known = Followers(part, followers.network[shard.pair], own, followers.history)
+        index = shard.frame[:, None] + torch.arange(steps + 1, device=shard.frame.device)
         index = index.clamp(max=part.mask.shape[1] - 1)
         leader_position = part.leader_position.gather(1, index)
         speed, moved = [], []
         for generator in generators:
             loop = simulate_closed_loop(
-                simulator, agent, known, chunk.frame, state=state, generator=generator
+                stepper, agent, known, shard.frame, state=state, generator=generator
             )
             position = leader_position - loop.gap
             speed.append(loop.speed)
@@ -210,13 +210,13 @@ def _begun(agent: Agent, followers: Followers, pairs: Tensor) -> AgentState:
     return agent.begin(followers.network[pairs], DriverContext(own))
 
 
-def _chunks(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origins]:
-    """Cuts origins into parts whose signals and states fit the memory."""
+def _shards(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origins]:
+    """Cuts origins into shards whose signals and states fit the memory."""
     frames = batch.mask.shape[1]
     per_origin = _COPIES * (len(RECORDED) + len(batch.surroundings) + 2) * frames
     states = agent.core.network.initial_state(len(agent.names), 1)
     per_origin += _COPIES * math.prod(states.shape[2:])
-    size = max(1, _CHUNK_BYTES // (8 * per_origin))
+    size = max(1, _SHARD_BYTES // (8 * per_origin))
     for first in range(0, len(origins), size):
         yield origins[first : first + size]
 

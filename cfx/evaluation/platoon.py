@@ -233,15 +233,15 @@ def simulate_platoons(
     for agent in agents:
         network = torch.arange(len(agent.names), device=device).repeat(VEHICLES)
         states.append(agent.begin(network))
-    simulator = agents[0].stepper(MemoryStepper(model, dt, compile="never"))
-    follower = simulator.begin(road.start())
+    stepper = agents[0].stepper(MemoryStepper(model, dt, compile="never"))
+    follower = stepper.begin(road.start())
     parameters: dict[str, Tensor] = {}
     for frame in range(road.speed.shape[-1] - 1):
         if frame % windows.stride == 0:
             seen = [road.history(frame, windows.length, part) for part in parts]
             chosen, states = _choose(agents, seen, states, generator)
             parameters = agents[0].space.unpack(chosen)
-        follower, _, _ = simulator.advance(follower, road.leader(frame), parameters)
+        follower, _, _ = stepper.advance(follower, road.leader(frame), parameters)
         road.write(frame + 1, follower)
     return [(road.speed[:, part], road.gap[:, part]) for part in parts]
 

@@ -5,6 +5,7 @@ Shapes: K + 1 frames, n tuned parameters.
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -250,7 +251,10 @@ class Evaluation:
         values = self.values[self.values["method"] != "policy"].reset_index(drop=True)
         platoon = self.platoon
         if platoon is not None:
-            platoon = Platoon(*(one[one["method"] != "policy"] for one in vars(platoon).values()))
+            table, measures = platoon.table, platoon.measures
+            platoon = Platoon(
+                table[table["method"] != "policy"], measures[measures["method"] != "policy"]
+            )
         return replace(self, about=about, values=values, platoon=platoon)
 
     @property
@@ -298,22 +302,22 @@ class Evaluation:
 
     def _trajectories_of(self, pieces: Sequence[PairTrajectory]) -> pd.DataFrame:
         """Returns the rows of some pairs of `trajectories_table`."""
-        columns: dict[str, object] = {
-            "pair_id": np.repeat(
-                np.array([one.pair_id for one in pieces], dtype=object),
-                [len(one.time) for one in pieces],
-            ),
-            "time_s": np.concatenate([one.time for one in pieces]),
-            "leader_speed": np.concatenate([one.leader_speed for one in pieces]),
-            "real_speed": np.concatenate([one.real_speed for one in pieces]),
-            "real_gap": np.concatenate([one.real_gap for one in pieces]),
-        }
-        for method in self.methods:
-            columns[f"speed_{method}"] = np.concatenate([one.speed[method] for one in pieces])
-            columns[f"gap_{method}"] = np.concatenate([one.gap[method] for one in pieces])
-            chosen = np.concatenate([one.parameters[method] for one in pieces])
-            for k, name in enumerate(self.names):
-                columns[f"{name}_{method}"] = chosen[:, k]
+        # Lists of arrays by column: one concatenation each is ten times as fast as a table a pair.
+        parts: dict[str, list[Array]] = defaultdict(list)
+        for piece in pieces:
+            parts["pair_id"].append(np.full(len(piece.time), piece.pair_id, dtype=object))
+            parts["time_s"].append(piece.time)
+            parts["leader_speed"].append(piece.leader_speed)
+            parts["real_speed"].append(piece.real_speed)
+            parts["real_gap"].append(piece.real_gap)
+            for method in self.methods:
+                parts[f"speed_{method}"].append(piece.speed[method])
+                parts[f"gap_{method}"].append(piece.gap[method])
+                for k, name in enumerate(self.names):
+                    parts[f"{name}_{method}"].append(piece.parameters[method][:, k])
+        columns = {}
+        for column, arrays in parts.items():
+            columns[column] = np.concatenate(arrays)
         return pd.DataFrame(columns)
 
 

@@ -61,11 +61,10 @@ def site_table(pairs: PairSet, evaluation: Evaluation) -> pd.DataFrame | None:
 def _labels(pairs: PairSet, evaluation: Evaluation) -> pd.DataFrame:
     """Returns site, driver and driver type of the tested pairs, by pair id."""
     tested = set(evaluation.about["pair_id"])
-    labels = [
-        (pair.pair_id, pair.site, pair.driver, pair.driver_type)
-        for pair in pairs
-        if pair.pair_id in tested
-    ]
+    labels = []
+    for pair in pairs:
+        if pair.pair_id in tested:
+            labels.append((pair.pair_id, pair.site, pair.driver, pair.driver_type))
     columns = ["pair_id", "site", "driver", "driver_type"]
     return pd.DataFrame(labels, columns=columns).set_index("pair_id")
 

@@ -16,7 +16,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.calibration.calibrator import Labels
+from cfx.calibration.calibrator import WindowLabels
 from cfx.calibration.objectives import Objective
 from cfx.calibration.rmse import SpeedRmse
 from cfx.core.component import Component
@@ -66,7 +66,7 @@ class TrainingPairs:
     network: Tensor
     fixed: Tensor
     base: Tensor | None = None
-    labels: Labels | None = None
+    labels: WindowLabels | None = None
     drivers: tuple[str, ...] | None = None
     sites: tuple[str, ...] | None = None
 
@@ -84,7 +84,7 @@ class TrainingData:
     """What a learner may see: the training part of some pairs.
 
     Attributes:
-        simulator: simulates the driving model, with its time step.
+        stepper: simulates the driving model, with its time step.
         recorded: U pairs, full trajectories; only frames up to `pairs.split.frame` may be read.
         pairs: what is learned from each of P pairs, and by which network.
         windows: how trajectories are cut.
@@ -97,7 +97,7 @@ class TrainingData:
         engine: where independent networks may train.
     """
 
-    simulator: Stepper
+    stepper: Stepper
     recorded: PairBatch
     pairs: TrainingPairs
     windows: WindowSettings
@@ -232,20 +232,22 @@ def learned_range(training_data: TrainingData, augment: Augment | None = None) -
     versions = [situations(recorded)]
     if augment is not None:
         versions.append(situations(augment(recorded, rows)))
-    found = []
+    by_network = []
     for number in range(len(training_data.names)):
-        own = networks[rows] == number
-        found.append(torch.cat([version[own][counted[own]] for version in versions]))
-    return ValidRange.of(found)
+        of_network = networks[rows] == number
+        seen = [version[of_network][counted[of_network]] for version in versions]
+        by_network.append(torch.cat(seen))
+    return ValidRange.of(by_network)
 
 
 def _some_of_each(network: Tensor, networks: int) -> Tensor:
     """Returns rows of each network, all or `_PAIRS_AT_MOST` of them, in order, `(S,)`."""
     chosen = []
     for number in range(networks):
-        own = (network == number).nonzero()[:, 0]
-        if len(own) > _PAIRS_AT_MOST:
-            at = torch.arange(_PAIRS_AT_MOST, device=own.device) * len(own) // _PAIRS_AT_MOST
-            own = own[at]
-        chosen.append(own)
+        rows = (network == number).nonzero()[:, 0]
+        if len(rows) > _PAIRS_AT_MOST:
+            # At equal distances, so that every site and time of a recording is among them.
+            at = torch.arange(_PAIRS_AT_MOST, device=rows.device) * len(rows) // _PAIRS_AT_MOST
+            rows = rows[at]
+        chosen.append(rows)
     return torch.cat(chosen).sort().values

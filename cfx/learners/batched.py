@@ -37,6 +37,8 @@ class Training(Protocol):
     """Settings that every such learner has."""
 
     @property
+    def epochs(self) -> int: ...
+    @property
     def learning_rate(self) -> float: ...
     @property
     def weight_decay(self) -> float: ...
@@ -202,20 +204,20 @@ def clip_each(network: PolicyNetwork, largest: float) -> None:
         gradient.nan_to_num_(0.0, 0.0, 0.0).mul_(of_network)
 
 
-def fit(
-    module: BatchedModule, epochs: int, seed: int, device: torch.device, checkpoint: Path | None
-) -> None:
+def fit(module: BatchedModule, seed: int, device: torch.device, checkpoint: Path | None) -> None:
     """Trains with Lightning, quietly, and puts the best weights back.
 
     Args:
         module: what is trained.
-        epochs: at most.
         seed: of what dropout draws.
         device: where.
         checkpoint: written after every epoch, so that interrupted training goes on there, and
             training that ended gives the same at once. None: no such file.
     """
-    is_gpu = device.type == "cuda"
+    accelerator = "gpu" if device.type == "cuda" else "cpu"
+    callbacks: list[pl.Callback] = []
+    if checkpoint is not None:
+        callbacks.append(EveryEpoch(checkpoint))
     module.begin_random_numbers(seed, device)
     with (
         dropout_from(module.network, module.generator),
@@ -229,11 +231,11 @@ def fit(
         of_compiler = r"The \.grad attribute of a Tensor that is not a leaf"
         warnings.filterwarnings("ignore", message=of_compiler)
         trainer = pl.Trainer(
-            max_epochs=epochs,
-            accelerator="gpu" if is_gpu else "cpu",
+            max_epochs=module.settings.epochs,
+            accelerator=accelerator,
             devices=1,
             logger=False,
-            callbacks=[] if checkpoint is None else [EveryEpoch(checkpoint)],
+            callbacks=callbacks,
             # Jobs in a queue of Slurm are no parts of one training on many machines.
             plugins=[LightningEnvironment()],
             enable_checkpointing=False,

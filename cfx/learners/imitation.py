@@ -105,7 +105,7 @@ class ImitationLearner(Learner):
         from cfx.learners.imitation_module import ImitationDataset, ImitationModule
 
         s, device = self.settings, training_data.device
-        head = head_class(s.head).for_model(training_data.simulator.model, device)
+        head = head_class(s.head).for_model(training_data.stepper.model, device)
         space, names, fixed = head.space, training_data.names, training_data.pairs.fixed
         weighs = s.weight_by_sensitivity
         dataset = ImitationDataset.of(policy, training_data, head, s.validation, weighs=weighs)
@@ -126,14 +126,17 @@ class ImitationLearner(Learner):
             if self._is_worth_compiling(dataset.windows, device):
                 module.compile_step()
             with task:
-                fit(module, s.epochs, training_data.seed, device, None)
+                fit(module, training_data.seed, device, None)
             curves = module.curves()
             warn_of_nothing_learned(curves)
+        base = None
+        if head.needs_base:
+            base = space.from_unit(pooled.to(fixed.dtype))
         return TrainingResult(
             network=network.eval(),
             scaler=dataset.scaler,
             curves=curves,
-            base=space.from_unit(pooled.to(fixed.dtype)) if head.needs_base else None,
+            base=base,
             head=head.name,
             valid_range=learned_range(training_data),
         )

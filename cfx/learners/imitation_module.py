@@ -93,11 +93,12 @@ class ImitationDataset(NamedTuple):
             weight = _sensitivity_weight(sensitivity, train)
         # Each pair is learned from with its base, and with the pooled one where that is another.
         rows, network = torch.arange(pairs, device=device), training_data.pairs.network.to(device)
-        pooled, own = training_data.pairs.fixed, training_data.pairs.base
+        pooled, driver_specific = training_data.pairs.fixed, training_data.pairs.base
         base = head.space.to_unit(pooled).float()
-        if own is not None and head.needs_base and not torch.equal(own, pooled):
+        has_both = driver_specific is not None and not torch.equal(driver_specific, pooled)
+        if driver_specific is not None and has_both and head.needs_base:
             rows, network = rows.repeat(2), network.repeat(2)
-            base = torch.cat([head.space.to_unit(own).float(), base])
+            base = torch.cat([head.space.to_unit(driver_specific).float(), base])
         grid = Grid(network, len(training_data.names))
         conditioning = head.condition(base)[:, None].expand(-1, mask.shape[1], -1)
         features = grid.scatter(torch.cat([tokens_of_pairs[rows], conditioning], -1))

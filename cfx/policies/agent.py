@@ -1,8 +1,10 @@
 """The agent, which drives in evaluation, platoons and SUMO, and is saved as a policy.
 
-An agent is made of three things: a context of each driver (`cfx.policies.context`), networks with
-their scaler and inputs, and a parameter head (both in `cfx.policies.core`). Training through the
-simulation uses the same core on the same grid.
+Each class says one thing. `AgentCore` is the policy itself: networks with their scaler, their
+inputs and their head, as pure functions, which training uses too. `AgentState` is what is
+remembered of drivers between two windows. `Agent` drives many of them, window by window;
+`cfx.policies.driver_step.DriverStep` drives step by step, for other programs. What an agent is told
+of drivers beforehand is a `DriverContext`, which `cfx.policies.known_drivers` measures.
 
 Life cycle for D drivers: `begin` once; `observe` (or `burn_in` over measured history) any number of
 times; then `act` once per window.
@@ -139,19 +141,19 @@ class Agent:
         """The parameters that the agent chooses, with their bounds."""
         return self.core.head.space
 
-    def stepper(self, simulator: Stepper) -> Stepper:
+    def stepper(self, stepper: Stepper) -> Stepper:
         """Returns what takes the steps of the model that this agent drives.
 
         Args:
-            simulator: takes those of the job's driving model.
+            stepper: takes those of the job's driving model.
 
         Raises:
             ConfigError: the head needs a model around it, which this simulator does not have.
         """
-        model = self.core.head.driven_model(simulator.model)
-        if model is simulator.model:
-            return simulator
-        return simulator.for_model(model)
+        model = self.core.head.driven_model(stepper.model)
+        if model is stepper.model:
+            return stepper
+        return stepper.for_model(model)
 
     def begin(self, network: Tensor, context: DriverContext = UNSEEN) -> AgentState:
         """Returns the state of D drivers before their first window.
@@ -297,13 +299,15 @@ class Agent:
 
     def only(self, numbers: Tensor) -> Agent:
         """Returns the agent with some of its networks, `(M,)` int64, which are numbered anew."""
-        names = tuple(self.names[number] for number in numbers.tolist())
+        names = tuple([self.names[number] for number in numbers.tolist()])
         core = self.core.only(numbers)
-        return replace(self._each(lambda of: of[numbers.to(of.device)]), core=core, names=names)
+        chosen = self._each(lambda values: values[numbers.to(values.device)])
+        return replace(chosen, core=core, names=names)
 
     def to(self, device: torch.device) -> Agent:
         """Moves everything to a device."""
-        return replace(self._each(lambda of: of.to(device)), core=self.core.to(device))
+        moved = self._each(lambda values: values.to(device))
+        return replace(moved, core=self.core.to(device))
 
     def _each(self, change: Callable[[Tensor], Tensor]) -> Agent:
         """Returns the agent with each tensor of its networks, `(N, ...)`, changed alike."""
@@ -378,7 +382,18 @@ class Agent:
         return torch.where(features.isnan(), usual, features.to(usual))
 
     def _features(self, history: History, state: AgentState) -> Tensor:
-        """Returns what the networks read, `(N, B, f + c)`, not normalised; 0 at empty places."""
+        """Returns what the networks read, `(N, B, f + c)`, not normalised; 0 at empty places.
+
+        Raises:
+            DataError: the history lacks a signal that an input of the policy reads.
+        """
+        for signal in self.core.further_signals:
+            if signal.name not in history:
+                raise DataError(
+                    f"an input of the policy reads the signal '{signal.name}' ({signal.meaning}),"
+                    f" which is not there; give a recording with a column {signal.column}, read by"
+                    " data=tidy data.inputs=[...]"
+                )
         seen = self.core.encode(history)
         features = torch.cat([seen, state.conditioning.to(seen.dtype)], -1)
         networks, drivers, _ = state.state.shape

@@ -127,24 +127,24 @@ class Scaler(nn.Module):
             values: `(N, B, W, f)`.
             mask: which windows count, bool `(N, B, W)`.
         """
-        return cls.of_parts(lambda: [(values, mask)])
+        return cls.of_shards(lambda: [(values, mask)])
 
     @classmethod
-    def of_parts(cls, parts: Callable[[], Iterable[tuple[Tensor, Tensor]]]) -> Scaler:
+    def of_shards(cls, shards: Callable[[], Iterable[tuple[Tensor, Tensor]]]) -> Scaler:
         """As `of`, some drivers after the other.
 
         Args:
-            parts: gives features `(N, b, W, f)` and masks `(N, b, W)` of the next drivers; called
+            shards: gives features `(N, b, W, f)` and masks `(N, b, W)` of the next drivers; called
                 twice.
         """
         total, added = torch.zeros(()), torch.zeros(())
-        for values, mask in parts():
+        for values, mask in shards():
             weight = mask[..., None].to(values.dtype)
             total = total.to(weight) + weight.sum((1, 2))
             added = added.to(weight) + (values * weight).sum((1, 2))
         total = total.clamp(min=1.0)
         mean, squares = added / total, torch.zeros_like(added)
-        for values, mask in parts():
+        for values, mask in shards():
             weight = mask[..., None].to(values.dtype)
             squares += ((values - mean[:, None, None]).square() * weight).sum((1, 2))
         scale = (squares / total).sqrt()

@@ -48,7 +48,7 @@ def predict_frame(agent: Agent, frame: pd.DataFrame) -> pd.DataFrame:
     now = measured_history(batch, everyone, until, agent.windows.length)
     chosen, _ = agent.act(now, state)
     table = pd.DataFrame(chosen.tolist(), columns=list(agent.space.names))
-    table.insert(0, "pair_id", [pair.pair_id for pair in pairs])
+    table.insert(0, "pair_id", pairs.ids)
     return table
 
 

@@ -108,7 +108,7 @@ Chosen = Literal["own", "all"] | tuple[str, ...]
 """Which metrics, tables or figures of those that are installed."""
 
 
-class JobParts(Settings):
+class JobNodes(Settings):
     """The components that a job is made of, each by its node."""
 
     data: Node = Field(description="the dataset's node")
@@ -192,7 +192,7 @@ class JobRecords(Settings):
     )
 
 
-class JobConfig(JobParts, JobResources, JobRecords):
+class JobConfig(JobNodes, JobResources, JobRecords):
     """Everything that one job needs to know; `conf/config.yaml` says the same in YAML."""
 
     preset: str | None = Field(

@@ -48,7 +48,7 @@ def read_result(origin: Origin) -> Result:
             raise DataError(f"{pairs} is damaged: it has no row of the method 'policy' or 'fixed'")
     missing = []
     for table in installed():
-        if table.part.always and table.name not in tables:
+        if table.component.always and table.name not in tables:
             missing.append(file_of(table))
     hydra = folder if origin.hydra is None else origin.hydra
     typed = optional(hydra / ".hydra" / "overrides.yaml", read_yaml_list)

@@ -194,7 +194,7 @@ def installed() -> tuple[registry.Installed[ResultTable], ...]:
 
 def file_of(table: registry.Installed[ResultTable]) -> str:
     """Returns the name of a table's file."""
-    return table.name + table.part.suffix
+    return table.name + table.component.suffix
 
 
 def parts_of(
@@ -244,17 +244,17 @@ def tables_of(
             if path is not None:
                 path.unlink(missing_ok=True)
             continue
-        if not table.part.large:
+        if not table.component.large:
             rows = pd.concat(list(parts))
             sources[table.name] = rows
             parts = iter([rows])
         elif path is None:
             sources[table.name] = partial(_together, table, evaluation)
         else:
-            sources[table.name] = partial(table.part.read, path)
+            sources[table.name] = partial(table.component.read, path)
         if path is not None:
             with atomic_write(path) as temporary:
-                table.part.write(temporary, parts)
+                table.component.write(temporary, parts)
     for table in installed():
         if table.name in sources:
             metrics |= _metrics_of(table, evaluation)
@@ -283,7 +283,7 @@ def stored_tables(folder: Path) -> Tables:
     for table in installed():
         path = folder / file_of(table)
         if path.exists():
-            sources[table.name] = partial(table.part.read, path)
+            sources[table.name] = partial(table.component.read, path)
     return Tables(sources)
 
 

@@ -121,7 +121,7 @@ class SimulatorSettings(Settings):
     """Settings that every simulator has."""
 
     memory_mb: int = Field(
-        1024, ge=16, description="bound for what one chunk of calibration problems takes, MB"
+        1024, ge=16, description="bound for what one shard of calibration problems takes, MB"
     )
 
 

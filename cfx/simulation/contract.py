@@ -26,10 +26,14 @@ def drivable(simulator: Simulator, model: DrivingModel | None = None) -> Driving
     Raises:
         NotApplicable: it drives none of them, or what it needs is not installed.
     """
-    found = once(simulator, "drivable", lambda: _first_drivable(simulator))
-    if model is None and found is None:
+
+    def first() -> DrivingModel | None:
+        return _first_drivable(simulator)
+
+    usual = once(simulator, "drivable", first)
+    if model is None and usual is None:
         raise NotApplicable("the simulator drives none of the usual models; give it one of its own")
-    return cast(DrivingModel, model or found)
+    return cast(DrivingModel, model or usual)
 
 
 def _first_drivable(simulator: Simulator) -> DrivingModel | None:
@@ -49,7 +53,11 @@ def _first_drivable(simulator: Simulator) -> DrivingModel | None:
 
 def stepper_of(simulator: Simulator, model: DrivingModel) -> Stepper:
     """Returns one stepper for all checks of a simulator: it may take seconds to start."""
-    return once(simulator, model, lambda: simulator.stepper(model, DT))
+
+    def made() -> Stepper:
+        return simulator.stepper(model, DT)
+
+    return once(simulator, model, made)
 
 
 def makes_a_stepper_for_the_model(simulator: Simulator, model: DrivingModel | None = None) -> None:
@@ -89,8 +97,13 @@ def steps_in_this_process_keep_shape_and_dtype(
     for dtype in (torch.float64, torch.float32):
         follower, ahead, p = in_dtype(states, dtype)
         start = Start(follower.position, follower.speed, follower.acceleration)
-        position, speed, acceleration = (signal.expand(STEPS, DRIVES) for signal in ahead[:3])
-        expect_steps(stepper, start, Leader(position, speed, acceleration, ahead.length), p)
+        leader = Leader(
+            ahead.position.expand(STEPS, DRIVES),
+            ahead.speed.expand(STEPS, DRIVES),
+            ahead.acceleration.expand(STEPS, DRIVES),
+            ahead.length,
+        )
+        expect_steps(stepper, start, leader, p)
 
 
 def expect_steps(stepper: Stepper, start: Start, leader: Leader, p: Mapping[str, Tensor]) -> None:

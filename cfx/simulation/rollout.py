@@ -15,7 +15,6 @@ import copy
 import importlib.util
 import itertools
 import math
-import shutil
 import sysconfig
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -32,7 +31,7 @@ from cfx.errors import ParameterError
 from cfx.models.base import DrivingModel, Follower, Leader
 from cfx.simulation.base import Simulator, SimulatorSettings, Stepper
 from cfx.simulation.kernel import run as kernel
-from cfx.simulation.kernel.compiler import torch_compiled
+from cfx.simulation.kernel.compiler import find_compiler, torch_compiled
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.trajectory import (
     ComponentKey,
@@ -47,9 +46,9 @@ Compile = Literal["auto", "always", "never"]
 _Parameters = dict[str, Tensor]
 _Step = Callable[[Follower, Leader, _Parameters], tuple[Follower, Tensor, Tensor]]
 
-_BLOCK = 5
+_STEPS_OF_CALL = 5
 """Steps that one compiled call takes: a window of the paper. State and parameters stay in registers
-meanwhile; longer blocks were not faster and take long to compile.
+meanwhile; more steps were not faster and take long to compile.
 """
 
 _WORTH_COMPILING = 20_000_000
@@ -58,7 +57,7 @@ pays: about a second of eager work. The rule looks at these alone, so that the s
 same bits whatever came before it.
 """
 
-_BOUND = 1e-6
+_ROUNDING = 1e-6
 """Share of a range by which rounding may put a value beyond its bound."""
 
 _WORTH_A_KERNEL = 1_000_000
@@ -102,17 +101,17 @@ class MemoryStepper(Stepper):
             return eager(follower, leader, dict(p))
         with torch.no_grad():
             compiled = self._compiles(steps, follower.speed)
-            size = tile_size(follower.speed)
+            size = shard_size(follower.speed)
             if not compiled and follower.speed.numel() <= size:
                 return eager(follower, leader, dict(p))
-            return self._in_tiles(follower, leader, p, size, compiled=compiled)
+            return self._in_shards(follower, leader, p, size, compiled=compiled)
 
     def for_model(self, model: DrivingModel) -> MemoryStepper:
         stepper = copy.copy(self)
         stepper.model = model
         return stepper
 
-    def _in_tiles(
+    def _in_shards(
         self,
         follower: Follower,
         leader: Leader,
@@ -121,30 +120,35 @@ class MemoryStepper(Stepper):
         *,
         compiled: bool,
     ) -> tuple[Follower, Tensor, Tensor]:
-        """As `advance`, a tile of at most `size` followers after the other.
+        """As `advance`, a shard of at most `size` followers after the other.
 
-        Compiled steps go in blocks; what is left over goes step by step.
+        A compiled call takes `_STEPS_OF_CALL` steps; those left over are taken one by one.
         """
         steps, batch = len(leader.position), follower.speed.shape
-        contiguous = torch.contiguous_format
-        end = Follower(*(torch.empty_like(state, memory_format=contiguous) for state in follower))
-        position = follower.speed.new_empty((steps, *batch))
-        speed = follower.speed.new_empty((steps, *batch))
-        blocks = steps - steps % _BLOCK
+        new = follower.speed.new_empty
+        end = Follower(
+            new(batch),
+            new(batch),
+            new(batch),
+            follower.memory.new_empty((*batch, follower.memory.shape[-1])),
+        )
+        position, speed = new((steps, *batch)), new((steps, *batch))
+        in_calls = steps - steps % _STEPS_OF_CALL
         with one_thread():
-            for tile in tiles(batch, size):
-                last, own = tile.follower(follower), tile.parameters(p)
-                rows, speed_rows = tile.rows(position), tile.rows(speed)
+            for shard in shards(batch, size):
+                last, parameters = shard.follower(follower), shard.parameters(p)
+                position_rows, speed_rows = shard.rows(position), shard.rows(speed)
                 cuts, make = [0, steps], _stepper
-                if compiled and len(tile) > 1:
-                    cuts = [*range(0, blocks, _BLOCK), *range(blocks, steps + 1)]
+                if compiled and len(shard) > 1:
+                    cuts = [*range(0, in_calls, _STEPS_OF_CALL), *range(in_calls, steps + 1)]
                     make = _compiled_stepper
                 for first, until in itertools.pairwise(cuts):
                     take = make(self.model, self.dt, until - first)
-                    last, positions, speeds = take(last, tile.leader(leader, first, until), own)
-                    rows[first:until].copy_(positions.view(-1, *tile.shape))
-                    speed_rows[first:until].copy_(speeds.view(-1, *tile.shape))
-                tile.write(end, last)
+                    ahead = shard.leader(leader, first, until)
+                    last, positions, speeds = take(last, ahead, parameters)
+                    position_rows[first:until].copy_(positions.view(-1, *shard.shape))
+                    speed_rows[first:until].copy_(speeds.view(-1, *shard.shape))
+                shard.write(end, last)
         return end, position, speed
 
     def accumulates(self, p: Mapping[str, Tensor], terms: Terms) -> bool:
@@ -155,14 +159,16 @@ class MemoryStepper(Stepper):
     def accumulate(
         self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, every: int | None = None
     ) -> tuple[Tensor, ...] | None:
-        candidates = max(math.prod(value.shape[1:]) for value in p.values())
+        candidates = 1
+        for value in p.values():
+            candidates = max(candidates, math.prod(value.shape[1:]))
         steps = segments.counted.numel() * candidates
         if segments.speed.device.type != "cpu" or not self._pays(steps, _WORTH_A_KERNEL):
             return None
         return kernel.accumulate(self.model, self.dt, segments, p, terms, every)
 
-    def _compiles(self, steps: int, like: Tensor) -> bool:
-        return self._pays(steps * like.numel(), _WORTH_COMPILING) and can_compile(like.device)
+    def _compiles(self, steps: int, speed: Tensor) -> bool:
+        return self._pays(steps * speed.numel(), _WORTH_COMPILING) and can_compile(speed.device)
 
     def _pays(self, steps: int, worth: int) -> bool:
         work = max(steps, self._together)
@@ -209,8 +215,8 @@ def _compiled_stepper(model: DrivingModel, dt: float, steps: int) -> _Step:
     """Returns `_stepper`, compiled for a number of steps; equal models share it."""
     key = (kernel.model_key(model), float(model.temperature), dt, steps)
     if key not in _COMPILED:
-        # Each model and block has a cache of its own: torch counts recompilations per function, and
-        # gives up after eight.
+        # Each model and number of steps has a cache of its own: torch counts recompilations per
+        # function, and gives up after eight.
         take = _stepper(model, dt, steps)
         _COMPILED[key] = torch_compiled(take, dynamic=True, isolate_recompiles=True)
     return _COMPILED[key]
@@ -228,7 +234,7 @@ def can_compile(device: torch.device) -> bool:
     # Debian's Python comes without: they are in python3-dev.
     if not Path(sysconfig.get_path("include"), "Python.h").is_file():
         return False
-    return any(shutil.which(name) for name in ("g++", "clang++", "c++"))
+    return find_compiler() is not None
 
 
 @same_environment()
@@ -272,17 +278,24 @@ def simulate_follower(
     if outside == "refuse":
         _check_bounds(model, parameters)
     windows = _windows(model, parameters, start.speed, leader.position.shape[-1] - 1, window)
-    shapes = [leader.position.shape[:-1], leader.length.shape, *(state.shape for state in start)]
+    shapes = [leader.position.shape[:-1], leader.length.shape]
+    for state in start:
+        shapes.append(state.shape)
     for _, _, p in windows:
-        shapes += [value.shape for value in p.values()]
+        for value in p.values():
+            shapes.append(value.shape)
     batch = common_shape(shapes)
     stepper = MemoryStepper(model, dt, compile=compile)
-    follower = stepper.begin(Start(*(state.expand(batch) for state in start)))
-    in_time = [signal.movedim(-1, 0).contiguous() for signal in leader[:3]]
+    begin = Start(*(state.expand(batch) for state in start))
+    follower = stepper.begin(begin)
+    # (*batch, time) -> (time, *batch): a step reads contiguous memory.
+    x = leader.position.movedim(-1, 0).contiguous()
+    v = leader.speed.movedim(-1, 0).contiguous()
+    a = leader.acceleration.movedim(-1, 0).contiguous()
     positions, speeds = [follower.position[None]], [follower.speed[None]]
     for first, last, p in windows:
-        x, v, a = (signal[first:last] for signal in in_time)
-        follower, position, speed = stepper.advance(follower, Leader(x, v, a, leader.length), p)
+        ahead = Leader(x[first:last], v[first:last], a[first:last], leader.length)
+        follower, position, speed = stepper.advance(follower, ahead, p)
         positions.append(position)
         speeds.append(speed)
     position = torch.cat(positions).movedim(0, -1)
@@ -300,40 +313,45 @@ def _check_bounds(
     if isinstance(parameters, Tensor):
         if parameters.shape[-1] != len(model.space):
             return  # what is wrong with the shape is said where it is read
-        given = model.space.unpack(parameters)
-        given = {name: given[name] for name in model.space.names}
+        columns = model.space.unpack(parameters)
+        given = {name: columns[name] for name in model.space.names}
     else:
         given = parameters
     for name, value in given.items():
-        bounds = (model.space[name], model.adaptation_space[name])
-        low = min(one.low for one in bounds)
-        high = max(one.high for one in bounds)
+        calibrated, adapted = model.space[name], model.adaptation_space[name]
+        low, high = min(calibrated.low, adapted.low), max(calibrated.high, adapted.high)
         values = torch.as_tensor(value)
-        room = _BOUND * (high - low)
+        room = _ROUNDING * (high - low)
         wrong = (values < low - room) | (values > high + room)
         if bool(wrong.any()):
-            found = float(values[wrong].flatten()[0])
+            first = float(values[wrong].flatten()[0])
             raise ParameterError(
-                f"{name}={found:g} is outside its bounds, {low:g} to {high:g}"
-                f" {bounds[0].unit}; give a value within"
+                f"{name}={first:g} is outside its bounds, {low:g} to {high:g}"
+                f" {calibrated.unit}; give a value within"
             )
 
 
 def _windows(
     model: DrivingModel,
     parameters: Tensor | Mapping[str, Tensor | float] | None,
-    like: Tensor,
+    speed: Tensor,
     steps: int,
     window: int | None,
 ) -> list[tuple[int, int, _Parameters]]:
-    """Returns (first step, last step, parameters by name) of each stretch with constant ones."""
+    """Returns (first step, last step, parameters by name) of each stretch with constant ones.
+
+    Numbers get the dtype and the device of `speed`.
+    """
     space = model.space
     if not isinstance(parameters, Tensor):
-        given = {one.name: one.default for one in space} | dict(parameters or {})
+        given: dict[str, Tensor | float] = {}
+        for parameter in space:
+            given[parameter.name] = parameter.default
+        given.update(parameters or {})
         named = {}
         for name, value in given.items():
-            own = space[name].name  # raises where there is no such parameter
-            named[own] = torch.as_tensor(value, dtype=like.dtype, device=like.device)
+            parameter = space[name]  # raises where there is no such parameter
+            named[parameter.name] = torch.as_tensor(value, dtype=speed.dtype, device=speed.device)
         return [(0, steps, named)]
     if window is None:
         return [(0, steps, space.unpack(_columns(parameters)))]
@@ -359,15 +377,15 @@ def _columns(parameters: Tensor) -> Tensor:
     return parameters.movedim(-1, 0).contiguous().movedim(0, -1)
 
 
-_TILE_BYTES = 1 << 17
-"""What one tile of followers takes for each value. A tile does all its steps before the next
+_SHARD_BYTES = 1 << 17
+"""What one shard of followers takes for each value. A shard does all its steps before the next
 begins, so that the twenty or so values that a model reads and writes stay in the cache; otherwise
-memory sets the speed. Tiles run on one thread: two would wait for each other after every small
+memory sets the speed. Shards run on one thread: two would wait for each other after every small
 operation, thirty times as long where another program wants the core.
 """
 
 
-class Tile:
+class Shard:
     """A rectangle of a batch that is seen as rows and columns, `(prod(batch[:-1]), batch[-1])`.
 
     What goes into a step is copied into new one-dimensional tensors (`(time, n)` for the leader),
@@ -386,11 +404,11 @@ class Tile:
         return math.prod(self.shape)
 
     def rows(self, full: Tensor) -> Tensor:
-        """Returns the tile of a contiguous `(time, *batch)` as a view `(time, rows, columns)`."""
+        """Returns the shard of a contiguous `(time, *batch)` as a view `(time, rows, columns)`."""
         return full.view(len(full), *self._grid)[:, self._rows, self._columns]
 
     def follower(self, follower: Follower) -> Follower:
-        """Returns the tile's followers, each state `(n,)`."""
+        """Returns the shard's followers, each state `(n,)`."""
         width = follower.memory.shape[-1]
         memory = follower.memory.new_empty((len(self), width))
         memory.view(*self.shape, width).copy_(
@@ -404,7 +422,7 @@ class Tile:
         )
 
     def leader(self, leader: Leader, first: int, last: int) -> Leader:
-        """Returns the tile's leaders at frames `first` to `last - 1`, `(time, n)`."""
+        """Returns the shard's leaders at frames `first` to `last - 1`, `(time, n)`."""
         return Leader(
             self._flat_frames(leader.position[first:last]),
             self._flat_frames(leader.speed[first:last]),
@@ -413,17 +431,20 @@ class Tile:
         )
 
     def parameters(self, p: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """Returns the tile's parameters, `(n,)` each.
+        """Returns the shard's parameters, `(n,)` each.
 
         Constants stay 0-dimensional: they cost no memory traffic.
         """
-        own = {}
+        flat = {}
         for name, value in p.items():
-            own[name] = value.clone() if value.dim() == 0 else self._flat(value)
-        return own
+            if value.dim() == 0:
+                flat[name] = value.clone()
+            else:
+                flat[name] = self._flat(value)
+        return flat
 
     def write(self, end: Follower, last: Follower) -> None:
-        """Writes the tile's last state into the full batch's."""
+        """Writes the shard's last state into the full batch's."""
         self._write_state(end.position, last.position)
         self._write_state(end.speed, last.speed)
         self._write_state(end.acceleration, last.acceleration)
@@ -432,8 +453,8 @@ class Tile:
             last.memory.view(*self.shape, width)
         )
 
-    def _write_state(self, full: Tensor, part: Tensor) -> None:
-        self.rows(full[None])[0].copy_(part.view(self.shape))
+    def _write_state(self, full: Tensor, of_shard: Tensor) -> None:
+        self.rows(full[None])[0].copy_(of_shard.view(self.shape))
 
     def _flat(self, value: Tensor) -> Tensor:
         return self._copy(value.expand(self._batch).reshape(self._grid))
@@ -445,31 +466,31 @@ class Tile:
         return self._copy(full.reshape(frames, *self._grid))
 
     def _copy(self, grid: Tensor) -> Tensor:
-        """Copies the tile out of `(*time, all rows, all columns)` into a new `(*time, n)`."""
+        """Copies the shard out of `(*time, all rows, all columns)` into a new `(*time, n)`."""
         time = grid.shape[:-2]
         copy = grid.new_empty((*time, len(self)))
         copy.view(*time, *self.shape).copy_(grid[..., self._rows, self._columns])
         return copy
 
 
-def tile_size(like: Tensor) -> int:
-    """Returns how many followers one tile holds; on an accelerator, all."""
-    if like.device.type != "cpu":
-        return max(1, like.numel())
-    return _TILE_BYTES // like.element_size()
+def shard_size(speed: Tensor) -> int:
+    """Returns how many followers one shard holds; on an accelerator, all."""
+    if speed.device.type != "cpu":
+        return max(1, speed.numel())
+    return _SHARD_BYTES // speed.element_size()
 
 
-def tiles(batch: torch.Size, size: int) -> Iterator[Tile]:
-    """Cuts a batch into tiles of at most `size` followers: whole rows, or parts of one."""
+def shards(batch: torch.Size, size: int) -> Iterator[Shard]:
+    """Cuts a batch into shards of at most `size` followers: whole rows, or a stretch of one."""
     rows, columns = _grid(batch)
     width = min(size, columns)
     height = 1
     if width == columns:
         height = max(1, size // max(1, width))
     for top in range(0, rows, height):
-        own_rows = slice(top, min(top + height, rows))
+        rows_of_shard = slice(top, min(top + height, rows))
         for left in range(0, columns, width):
-            yield Tile(batch, own_rows, slice(left, min(left + width, columns)))
+            yield Shard(batch, rows_of_shard, slice(left, min(left + width, columns)))
 
 
 def _grid(batch: torch.Size) -> tuple[int, int]:

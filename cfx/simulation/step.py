@@ -36,8 +36,8 @@ def advance_vehicle(
     Returns:
         State at t + dt, in the dtype of the follower.
     """
-    wanted = model.next_speed(follower, leader, p, dt)
-    speed = limited_speed(model.limits, follower.speed, follower.acceleration, wanted, dt)
+    desired = model.next_speed(follower, leader, p, dt)
+    speed = limited_speed(model.limits, follower.speed, follower.acceleration, desired, dt)
     memory = model.next_memory(follower, leader, p, dt, speed)
     position = follower.position + speed * dt
     acceleration = (speed - follower.speed) / dt

@@ -252,10 +252,10 @@ def _true_parameters(
     """Returns true parameters in unit space, `(*drivers, windows, n)`."""
     default = np.array([(p.default - p.low) / (p.high - p.low) for p in space.tuned])
     room = 0.5 * np.minimum(default, 1.0 - default)
-    own = rng.uniform(-1.0, 1.0, (*drivers, 1, len(space)))
+    driver = rng.uniform(-1.0, 1.0, (*drivers, 1, len(space)))
     noise = smooth_noise((*drivers, len(space)), windows, step / _DRIFT_SCALE_S, rng)
     drift = np.tanh(0.7 * noise).swapaxes(-1, -2)
-    unit: Floats = default + room * (s.heterogeneity * own + s.variation * drift)
+    unit: Floats = default + room * (s.heterogeneity * driver + s.variation * drift)
     return unit
 
 
@@ -295,18 +295,18 @@ def leader_speed(
 
     It is never negative, and its acceleration and jerk are bounded.
     """
-    wanted = _wanted_speed(platoons, frames, dt, rng, cruise_mps)
-    speed = np.empty_like(wanted)
-    v, a = wanted[:, 0].copy(), np.zeros(platoons)
+    desired = _desired_speed(platoons, frames, dt, rng, cruise_mps)
+    speed = np.empty_like(desired)
+    v, a = desired[:, 0].copy(), np.zeros(platoons)
     for k in range(frames):
         speed[:, k] = v
-        aim = np.clip(_RESPONSE_PER_S * (wanted[:, k] - v), -_BRAKING_MPS2, _ACCELERATION_MPS2)
+        aim = np.clip(_RESPONSE_PER_S * (desired[:, k] - v), -_BRAKING_MPS2, _ACCELERATION_MPS2)
         a = a + np.clip(aim - a, -_JERK_MPS3 * dt, _JERK_MPS3 * dt)
         v = np.maximum(v + a * dt, 0.0)
     return speed
 
 
-def _wanted_speed(
+def _desired_speed(
     platoons: int,
     frames: int,
     dt: float,
@@ -328,13 +328,13 @@ def _wanted_speed(
     # search serves.
     platoon = np.arange(platoons)[:, None]
     shift = platoon * (ends.max() - ends.min() + frames * dt + 1.0)
-    found = np.searchsorted((ends + shift).ravel(), (time + shift).ravel(), side="right")
-    phase = found.reshape(platoons, frames) - 2 * waves * platoon
+    number = np.searchsorted((ends + shift).ravel(), (time + shift).ravel(), side="right")
+    phase = number.reshape(platoons, frames) - 2 * waves * platoon
     phase = np.clip(phase, 0, 2 * waves - 1)
     crawl_speed = np.take_along_axis(crawl, phase // 2, axis=1)
     speed = np.where(phase % 2 == 1, crawl_speed, cruise)
-    wanted: Floats = np.maximum(speed + variation, 0.0)
-    return wanted
+    desired: Floats = np.maximum(speed + variation, 0.0)
+    return desired
 
 
 def _measure(traffic: _Traffic, s: SyntheticSettings, rng: np.random.Generator) -> _Traffic:
@@ -360,11 +360,11 @@ def _pair(traffic: _Traffic, s: SyntheticSettings, platoon: int, place: int) -> 
     leader, follower = str(first + place), str(first + place + 1)
 
     def signals(vehicle: int, who: str) -> dict[str, Any]:
-        found = {}
+        columns = {}
         for name in ("position", "speed", "acceleration"):
             values = getattr(traffic, name)[platoon, vehicle]
-            found[f"{who}_{name}"] = np.ascontiguousarray(values)
-        return found
+            columns[f"{who}_{name}"] = np.ascontiguousarray(values)
+        return columns
 
     truth = {}
     for at, name in enumerate(traffic.names):

@@ -82,9 +82,9 @@ class Split:
         Raises:
             DataError: most are within one window, so that parameters are chosen once.
         """
-        tested = [
-            len(pair) - 1 - last for pair, last in zip(pairs, self.frame.tolist(), strict=True)
-        ]
+        tested = []
+        for pair, last in zip(pairs, self.frame.tolist(), strict=True):
+            tested.append(len(pair) - 1 - last)
         middle = statistics.median(tested)
         lasts = middle * pairs.dt
         if lasts >= TRANSIENT_S:

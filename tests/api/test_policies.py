@@ -69,8 +69,8 @@ def test_training_is_that_of_the_command_to_the_last_bit(
 
 def test_a_result_says_how_much_the_policy_improves(trained: cfx.plugin.Result) -> None:
     found = trained.improvement(over="population")
-    assert found["mean"] == trained.metrics["rmse_improvement/population/geometric"]
-    assert found["ci95_low"] <= found["mean"] <= found["ci95_high"]
+    assert found["geometric"] == trained.metrics["rmse_improvement/population/geometric"]
+    assert found["ci95_low"] <= found["geometric"] <= found["ci95_high"]
     with pytest.raises(DataError, match="known there: default, population, fixed"):
         trained.improvement(over="defaults")
     assert "rmse_speed" in trained._repr_html_()

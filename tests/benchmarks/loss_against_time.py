@@ -60,12 +60,12 @@ def problems(model: DrivingModel, pairs: int) -> Iterator[tuple[str, SegmentLoss
     pair_set = dataset.load()
     batch, windows = PairBatch.of(pair_set), WindowSettings()
     split = Split.of(pair_set, windows, _SPLIT)
-    simulator = MemoryStepper(model, batch.dt)
+    stepper = MemoryStepper(model, batch.dt)
     whole = torch.arange(len(batch))
     yield (
         "fixed",
         SegmentLosses.of_segments(
-            simulator, SpeedRmse(), batch, whole, torch.zeros_like(whole), split.frame
+            stepper, SpeedRmse(), batch, whole, torch.zeros_like(whole), split.frame
         ),
     )
     pair = whole.repeat_interleave(split.windows)
@@ -74,7 +74,7 @@ def problems(model: DrivingModel, pairs: int) -> Iterator[tuple[str, SegmentLoss
     yield (
         "labels",
         SegmentLosses.of_segments(
-            simulator, SpeedRmse(), batch, pair, number * windows.stride, steps
+            stepper, SpeedRmse(), batch, pair, number * windows.stride, steps
         ),
     )
 

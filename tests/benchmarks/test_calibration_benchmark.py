@@ -68,12 +68,12 @@ def segments(model: DrivingModel, problems: int, steps: int) -> SegmentLosses:
 
 def points_of(model: DrivingModel) -> Tensor:
     """Returns the candidates that random search tries besides the default set, `(q, n)`."""
-    return sobol(SAMPLES - 1, len(model.space.names), seed=0, like=torch.zeros(1).double())
+    return sobol(SAMPLES - 1, len(model.space.names), seed=0, device=torch.device("cpu"))
 
 
 def by_hand(losses: SegmentLosses, name: str) -> Callable[[], Tensor]:
     """Returns the numba loop over the same segments and the same candidates, compiled."""
-    model = losses.simulator.model
+    model = losses.stepper.model
     limits = model.limits
     assert limits is not None
     assert limits.acceleration == numba_loops.FASTEST

@@ -53,10 +53,10 @@ def windows(model: DrivingModel) -> SegmentLosses:
     length = torch.full((WINDOWS,), 4.5, dtype=torch.float64)
     leader = Leader(leader_position, leader_speed, acceleration.expand(STEPS, -1), length)
     start = Start(torch.zeros_like(speed), speed, uniform(-1.0, 1.0))
-    simulator = MemoryStepper(model, DT, compile="never")
+    stepper = MemoryStepper(model, DT, compile="never")
     truth = torch.rand(WINDOWS, len(model.space), generator=draw, dtype=torch.float64)
-    _, position, observed = simulator.advance(
-        simulator.begin(start), leader, model.space.unpack(model.space.from_unit(truth))
+    _, position, observed = stepper.advance(
+        stepper.begin(start), leader, model.space.unpack(model.space.from_unit(truth))
     )
     observed = observed + 0.02 * torch.randn(observed.shape, generator=draw, dtype=torch.float64)
     rear = leader_position + leader_speed * DT - length
@@ -71,7 +71,7 @@ def windows(model: DrivingModel) -> SegmentLosses:
         speed=start.speed,
         acceleration=start.acceleration,
     )
-    return SegmentLosses(simulator, SpeedRmse(), segments)
+    return SegmentLosses(stepper, SpeedRmse(), segments)
 
 
 def plain_loop(objective: SegmentLosses, guess: Tensor, *, initial: int, iterations: int) -> float:

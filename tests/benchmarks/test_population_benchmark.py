@@ -53,7 +53,7 @@ def drives(model: DrivingModel) -> SegmentLosses:
 @pytest.mark.parametrize("model", [Krauss(), W99()], ids=["krauss", "w99"])
 def test_population(benchmark: Any, model: DrivingModel) -> None:
     compiled = drives(model)
-    eager = replace(compiled, simulator=MemoryStepper(model, DT, compile="never"))
+    eager = replace(compiled, stepper=MemoryStepper(model, DT, compile="never"))
     fold = torch.arange(DRIVES) % FOLDS
     members = (fold != torch.arange(FOLDS + 1)[:, None]) | (
         torch.arange(FOLDS + 1)[:, None] == FOLDS

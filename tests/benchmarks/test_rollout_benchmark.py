@@ -128,9 +128,9 @@ class Case:
         self.start = Start(zero, zero + 9 + uniform(PROBLEMS, 1), zero)
 
     def torch(self, compile: Compile) -> Tensor:
-        simulator = MemoryStepper(self.model, DT, compile=compile)
+        stepper = MemoryStepper(self.model, DT, compile=compile)
         with torch.inference_mode():
-            return simulator.advance(simulator.begin(self.start), self.leader, self.p)[2]
+            return stepper.advance(stepper.begin(self.start), self.leader, self.p)[2]
 
     def numba(self) -> Callable[[], Array]:
         kernel, names = KERNELS[type(self.model)]

@@ -90,7 +90,7 @@ def test_a_gradient_step(benchmark: Any, model: DrivingModel, ensemble_size: int
         for how in ("always", "never")
     )
     windows = Step(model, RolloutSettings(compile="always", ensemble_size=ensemble_size))
-    windows.module.scans = {}
+    windows.module.compiled = {}
     windows.module.training_window.compile()
     alone = Step(model, RolloutSettings(compile="never", ensemble_size=1), networks=1)
     began = time.perf_counter()

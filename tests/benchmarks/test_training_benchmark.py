@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import nn
 
-from cfx.calibration.calibrator import Labels
+from cfx.calibration.calibrator import WindowLabels
 from cfx.core.threads import one_thread
 from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData, TrainingPairs
@@ -32,7 +32,7 @@ def _training_data() -> TrainingData:
         (len(windows), 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
     even = torch.ones(len(windows), dtype=torch.float64)
-    labels = Labels(
+    labels = WindowLabels(
         windows,
         model.space.from_unit(unit),
         even,

@@ -34,7 +34,7 @@ def main(count: int) -> None:
         drivers=tuple(str(number) for number in range(count)),
     )
     data = replace(data, recorded=data.recorded[copies], pairs=pairs, names=("all",))
-    head = head_class("offset").for_model(data.simulator.model)
+    head = head_class("offset").for_model(data.stepper.model)
     before = _most()
     settings = RolloutSettings(ensemble_size=2)
     dataset = RolloutDataset.of(data, GruPolicy(inputs="situation"), head, settings, generator)

@@ -32,7 +32,7 @@ from cfx.simulation.rollout import MemoryStepper
 from tests.drives import wavy_pairs
 
 here, seconds = Path(sys.argv[1]), float(sys.argv[2])
-module._GROUP = {GROUP}
+module._CLAIM = {GROUP}
 
 class Logged(RandomSearch):
     def solve(self, objective, guesses, *, seed):
@@ -140,7 +140,7 @@ def keys(count: int) -> list[str]:
 
 def test_what_is_claimed_is_left_to_its_owner_until_it_lets_go(tmp_path: Path) -> None:
     mine, theirs = Cache(tmp_path), Cache(tmp_path)
-    shares = mine.shares(keys(200), "labels")
+    shares = mine.shards(keys(200), "labels")
     sizes = {name: len(positions) for name, positions in shares.items()}
     assert sum(sizes.values()) == 200
     with mine.claim(sizes, 100) as claimed:
@@ -158,13 +158,13 @@ def test_a_share_that_is_more_than_enough_is_claimed_alone(tmp_path: Path) -> No
 
 def test_other_calibrations_are_not_kept_waiting(tmp_path: Path) -> None:
     cache = Cache(tmp_path)
-    one, two = cache.shares(keys(200), "krauss"), cache.shares(keys(200), "w99")
+    one, two = cache.shards(keys(200), "krauss"), cache.shards(keys(200), "w99")
     assert len(set(one) & set(two)) <= 2
 
 
 def test_the_locks_stay_few_however_many_calibrations_there_are(tmp_path: Path) -> None:
     cache = Cache(tmp_path)
-    names = {name for number in range(400) for name in cache.shares(keys(40), str(number))}
+    names = {name for number in range(400) for name in cache.shards(keys(40), str(number))}
     assert len(names) <= 4096
 
 
@@ -172,7 +172,7 @@ def test_without_a_cache_nothing_is_claimed_or_written(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    shares = Cache(None).shares(keys(200), "labels")
+    shares = Cache(None).shards(keys(200), "labels")
     assert [sorted(positions) for positions in shares.values()] == [list(range(200))]
     with Cache(None).claim(dict.fromkeys(shares, 200), 10) as claimed:
         assert claimed == list(shares)

@@ -22,7 +22,7 @@ from cfx.calibration.optimizers import CandidateLosses, Optimizer
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.calibration.shards import CalibrationShard, Solver
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.core import threads
 from cfx.core.engine import Engine, Report
 from cfx.data.pairs import PairBatch, PairSet
@@ -191,8 +191,8 @@ def test_other_data_is_not_mistaken(tmp_path: Path) -> None:
 def test_an_interrupted_calibration_goes_on_where_it_stopped(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("cfx.calibration.calibrator._GROUP", 40)
-    monkeypatch.setattr("cfx.calibration.calibrator._BLOCK", 40)
+    monkeypatch.setattr("cfx.calibration.calibrator._CLAIM", 40)
+    monkeypatch.setattr("cfx.calibration.calibrator._WINDOWS_OF_ENTRY", 40)
     pairs = wavy_pairs(Krauss(), TRUE)
     whole = everything(calibrator(Counting()), pairs)
     interrupted = Counting(stop_after=3 + 80)
@@ -268,7 +268,7 @@ def test_constant_drivers_of_the_synthetic_dataset_are_recovered() -> None:
     assert error["t_i"] < 0.15, error
 
 
-@pytest.mark.parametrize("objective", [GapRmse(), Mixed(), TheilU(), SpeedHuber()])
+@pytest.mark.parametrize("objective", [GapRmse(), Mixed(), TheilInequality(), SpeedHuber()])
 def test_every_objective_finds_what_determines_it(objective: Objective) -> None:
     pairs = wavy_pairs(Krauss(), TRUE)
     tool = calibrator(RandomSearch(samples=1024), objective=objective)
@@ -299,12 +299,12 @@ def test_a_calibration_reports_other_objectives_too() -> None:
 
 
 def test_ties_have_the_objectives_tolerance_unless_a_setting_says_another() -> None:
-    tool = calibrator(RandomSearch(samples=8), objective=TheilU())
-    assert tool.tie_tolerance(WindowSettings()) == TheilU.tie_tolerance
+    tool = calibrator(RandomSearch(samples=8), objective=TheilInequality())
+    assert tool.tie_tolerance(WindowSettings()) == TheilInequality.tie_tolerance
     assert tool.tie_tolerance(WindowSettings(tie_tolerance=0.0)) == 0.0
 
 
-@pytest.mark.parametrize("samples", [2048, 1 << 18], ids=["kernel", "a chunk for each driver"])
+@pytest.mark.parametrize("samples", [2048, 1 << 18], ids=["kernel", "a shard for each driver"])
 def test_the_number_of_cores_changes_no_bit(samples: int, request: pytest.FixtureRequest) -> None:
     request.addfinalizer(lambda: threads.limit_cores(None))
     pairs = wavy_pairs(Krauss(), TRUE, frames=60)
@@ -346,7 +346,7 @@ def test_a_cluster_shares_drivers_among_its_workers_and_changes_no_bit(
     optimizer: Optimizer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Small parts would not be worth compiling for; all of them together are."""
-    monkeypatch.setattr("cfx.calibration.calibrator._PART", 2)
+    monkeypatch.setattr("cfx.calibration.calibrator._TRAJECTORIES_OF_SHARD", 2)
     drivers = torch.stack([torch.linspace(1.0, 2.5, 5), torch.linspace(0.0, 0.6, 5)], dim=1)
     pairs = wavy_pairs(Krauss(), drivers.double(), frames=150)
     batch, elsewhere = PairBatch.of(pairs), Elsewhere()

@@ -71,7 +71,7 @@ def test_training_errors_are_those_of_the_measured_states(
         torch.testing.assert_close(errors, torch.zeros_like(errors), atol=1e-9, rtol=0)
 
 
-def test_chunks_change_nothing(calibrator: Calibrator, pairs: PairSet) -> None:
+def test_shards_change_nothing(calibrator: Calibrator, pairs: PairSet) -> None:
     batch = PairBatch.of(pairs)
     best = TRUE * 1.1
     ids = [pair.pair_id for pair in pairs]

@@ -9,7 +9,7 @@ from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
 from cfx.calibration.mixed import Mixed
 from cfx.calibration.objectives import FrameValues, Objective
 from cfx.calibration.rmse import GapRmse, SpeedRmse
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.data.pairs import PairBatch
 from cfx.models.base import Leader
 from cfx.models.krauss import Krauss
@@ -21,7 +21,7 @@ from tests.drives import wavy_pairs
 TRUE = torch.tensor([[1.2, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)
 
 
-OBJECTIVES = [SpeedRmse(), GapRmse(), Mixed(), TheilU(signal="gap")]
+OBJECTIVES = [SpeedRmse(), GapRmse(), Mixed(), TheilInequality(signal="gap")]
 
 
 @pytest.mark.parametrize("objective", OBJECTIVES, ids=lambda one: type(one).__name__)
@@ -75,10 +75,10 @@ def loss_of(
 def test_a_pooled_loss_is_the_mean_of_its_segments() -> None:
     truth = torch.tensor([[1.0, 0.1], [2.0, 0.4], [3.0, 0.8]], dtype=torch.float64)
     batch = PairBatch.of(wavy_pairs(Krauss(), truth))
-    simulator = MemoryStepper(Krauss(), 0.1)
+    stepper = MemoryStepper(Krauss(), 0.1)
     index, steps = torch.arange(3), torch.full((3,), 150)
     segments = SegmentLosses.of_segments(
-        simulator, SpeedRmse(), batch, index, torch.zeros_like(index), steps
+        stepper, SpeedRmse(), batch, index, torch.zeros_like(index), steps
     )
     members = torch.tensor([[True, True, False], [True, True, True]])
     candidates = torch.rand(
@@ -100,15 +100,15 @@ def test_many_trajectories_are_simulated_some_after_the_other(
 ) -> None:
     batch, index = PairBatch.of(wavy_pairs(Krauss(), TRUE)), torch.arange(3)
     last = torch.tensor([150, 150, 90])
-    simulator, objective = MemoryStepper(Krauss(), 0.1), SpeedRmse()
+    stepper, objective = MemoryStepper(Krauss(), 0.1), SpeedRmse()
     segments = SegmentLosses.of_segments(
-        simulator, objective, batch, index, torch.zeros_like(index), last
+        stepper, objective, batch, index, torch.zeros_like(index), last
     )
     members = torch.tensor([[True, True, False], [True, False, True]])
     candidates = torch.rand(
         (2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
-    trajectories = FullTrajectories(simulator, objective, batch, last)
+    trajectories = FullTrajectories(stepper, objective, batch, last)
     for asked in (candidates, candidates[:1].expand(2, -1, -1)):
         expected = PooledLosses(segments, members, memory=1 << 30)(asked)
         pooled = PooledLosses(trajectories, members, memory=1 << 30)
@@ -142,9 +142,9 @@ def test_pooled_losses_are_the_same_where_their_work_is_worth_compiling_for(
 ) -> None:
     pairs = wavy_pairs(Krauss(), torch.tensor([[1.0, 0.1], [2.0, 0.4]], dtype=torch.float64))
     index = torch.arange(2)
-    simulator = MemoryStepper(Krauss(), 0.1)
+    stepper = MemoryStepper(Krauss(), 0.1)
     segments = SegmentLosses.of_segments(
-        simulator,
+        stepper,
         SpeedRmse(),
         PairBatch.of(pairs),
         index,

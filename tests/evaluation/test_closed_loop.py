@@ -210,22 +210,22 @@ def test_the_table_says_what_the_loops_did() -> None:
     pairs = wavy_pairs(model, true)
     batch = PairBatch.of(pairs)
     first = torch.tensor([150, 200])
-    simulator = MemoryStepper(model, 0.1)
+    stepper = MemoryStepper(model, 0.1)
     loops = {
         "default": simulate_closed_loop(
-            simulator,
+            stepper,
             constant(model, model.space.defaults().expand(2, 2)),
             Followers(batch, torch.arange(2)),
             first,
         ),
         "fixed": simulate_closed_loop(
-            simulator,
+            stepper,
             constant(model, torch.tensor([[4.0, 0.1], [4.0, 0.1]]).double()),
             Followers(batch, torch.arange(2)),
             first,
         ),
         "policy": simulate_closed_loop(
-            simulator, constant(model, true), Followers(batch, torch.arange(2)), first
+            stepper, constant(model, true), Followers(batch, torch.arange(2)), first
         ),
     }
     style = StyleResult(

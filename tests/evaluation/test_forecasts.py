@@ -56,12 +56,12 @@ def test_a_driver_with_the_true_parameters_is_forecast_exactly(batch: PairBatch)
     torch.testing.assert_close(paths.travelled, measured.travelled, atol=1e-9, rtol=0)
 
 
-@pytest.mark.parametrize("chunk_bytes", [1, 1 << 28])
+@pytest.mark.parametrize("shard_bytes", [1, 1 << 28])
 def test_each_origin_is_a_closed_loop_of_its_own(
-    batch: PairBatch, chunk_bytes: int, monkeypatch: pytest.MonkeyPatch
+    batch: PairBatch, shard_bytes: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A batch of origins, in chunks of any size, is what each origin alone gives."""
-    monkeypatch.setattr(forecasts, "_CHUNK_BYTES", chunk_bytes)
+    """A batch of origins, in shards of any size, is what each origin alone gives."""
+    monkeypatch.setattr(forecasts, "_SHARD_BYTES", shard_bytes)
     agent, stepper = policy(), MemoryStepper(MODEL, 0.1)
     origins = Origins(torch.tensor([0, 2, 2]), torch.tensor([33, 100, 250]))
     network = torch.tensor([2, 0, 1])

@@ -64,7 +64,7 @@ def training_data(
     if isinstance(model, Krauss):
         fixed[:] = torch.tensor([4.0, 0.8])
     data = TrainingData(
-        simulator=MemoryStepper(model, 0.1),
+        stepper=MemoryStepper(model, 0.1),
         recorded=PairBatch.of(pairs),
         pairs=TrainingPairs(
             index=index,
@@ -84,7 +84,7 @@ def training_data(
 def ready(result: TrainingResult, data: TrainingData, policy: Policy) -> Agent:
     """Returns trained networks as an agent."""
     name = result.head or head_name(has_base=result.base is not None)
-    head = head_class(name).for_model(data.simulator.model)
+    head = head_class(name).for_model(data.stepper.model)
     return Agent(
         core=AgentCore(policy, result.network, result.scaler, head),
         model_node={},
@@ -109,7 +109,7 @@ def loop(
     agent = ready(result, data, policy)
     generator = None if seed is None else torch.Generator().manual_seed(seed)
     return simulate_closed_loop(
-        data.simulator,
+        data.stepper,
         agent,
         Followers(data.batch, data.pairs.network, base=base),
         frames,
@@ -139,7 +139,7 @@ def placed(
 ) -> RolloutDataset:
     """Returns the training data placed on networks."""
     generator = torch.Generator().manual_seed(seed)
-    made = head_class(head).for_model(data.simulator.model)
+    made = head_class(head).for_model(data.stepper.model)
     settings = RolloutSettings(validation=share, ensemble_size=ensemble_size)
     return RolloutDataset.of(data, policy, made, settings, generator)
 
@@ -160,7 +160,7 @@ def module_of(data: TrainingData, policy: Policy | None = None, **options: Any) 
     """Returns a module whose networks answer at random, so that they do something."""
     policy, settings = policy or gru(), RolloutSettings(**(QUICK | options))
     generator = torch.Generator().manual_seed(0)
-    head = head_class(settings.head).for_model(data.simulator.model)
+    head = head_class(settings.head).for_model(data.stepper.model)
     dataset = RolloutDataset.of(data, policy, head, settings, generator)
     blank = torch.full((len(dataset.pair), 2), 0.5)
     network = policy.build(dataset.scaler.mean.shape[-1], blank[0], blank, generator)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from cfx.calibration.calibrator import Labels
+from cfx.calibration.calibrator import WindowLabels
 from cfx.data.pairs import PairBatch
 from cfx.errors import DataError
 from cfx.learners.base import TrainingData, TrainingPairs, TrainingResult
@@ -43,7 +43,7 @@ def training_data(
     speed = batch.leader_speed[windows.pair, windows.first]
     unit = torch.stack([speed / 20, 1 - speed / 20], dim=-1).clamp(0.05, 0.95)
     even = torch.full((len(windows),), sensitivity).double()
-    labels = Labels(
+    labels = WindowLabels(
         windows=windows,
         parameters=model.space.from_unit(unit),
         loss=even,
@@ -55,7 +55,7 @@ def training_data(
         names = ["all"] * pairs
     network, groups = group_by(names)
     return TrainingData(
-        simulator=MemoryStepper(model, 0.1),
+        stepper=MemoryStepper(model, 0.1),
         recorded=batch,
         pairs=TrainingPairs(
             index=torch.arange(pairs),
@@ -73,7 +73,7 @@ def training_data(
 def own_bases(data: TrainingData) -> torch.Tensor:
     """Returns a base for each driver, `(P, n)`, all different."""
     shift = torch.linspace(-0.2, 0.2, len(data.pairs.fixed)).double()[:, None]
-    space = data.simulator.model.space
+    space = data.stepper.model.space
     return space.from_unit(space.to_unit(data.pairs.fixed) + shift)
 
 
@@ -122,7 +122,7 @@ def test_offsets_are_learned_from_each_drivers_base_and_from_the_pooled_one() ->
     data = replace(data, pairs=replace(data.pairs, labels=labels, base=own))
     learner = ImitationLearner(epochs=60, learning_rate=0.02, patience=None, head="offset")
     result = learner.fit(GruPolicy(), data)
-    agent, space = ready(result, data, GruPolicy()), data.simulator.model.space
+    agent, space = ready(result, data, GruPolicy()), data.stepper.model.space
     truth = space.to_unit(own)
     errors = {}
     for name, base in (("own", own), ("pooled", None)):

@@ -46,8 +46,8 @@ def speeds(model: DrivingModel, start: Start, leader: Leader, *parameters: float
     """Returns the speeds of one follower at all steps, `(T,)`."""
     wrapped = WithResidual(model)
     p = wrapped.space.unpack(torch.tensor([parameters]).double())
-    simulator = MemoryStepper(wrapped, DT)
-    return simulator.advance(simulator.begin(start), leader, p)[2][:, 0]
+    stepper = MemoryStepper(wrapped, DT)
+    return stepper.advance(stepper.begin(start), leader, p)[2][:, 0]
 
 
 def start(speed: float, acceleration: float) -> Start:
@@ -71,8 +71,8 @@ def test_it_starts_with_the_measured_acceleration_and_hands_over_to_the_model() 
     p = {"a": alone, "residual_time": tau, "residual_target": target}
     p |= {"residual_jerk": jerk, "residual_jerk_time": torch.full_like(jerk, forget)}
     p |= {"residual_handover": handover}
-    simulator = MemoryStepper(model, DT)
-    _, _, speed = simulator.advance(simulator.begin(begin), far_leader(60, 1), p)
+    stepper = MemoryStepper(model, DT)
+    _, _, speed = stepper.advance(stepper.begin(begin), far_leader(60, 1), p)
     kept, steps = torch.exp(-DT / tau), torch.arange(60).double()[:, None]
     lost = math.exp(-DT / forget)
     held = measured + jerk * DT * lost * (1.0 - lost**steps) / (1.0 - lost)
@@ -90,8 +90,8 @@ def test_the_acceleration_hardly_changes_from_step_to_step(model: DrivingModel) 
     leader = leader._replace(position=leader.position - 985.0)
     parameters = (*model.space.defaults().tolist(), *(each.default for each in RESIDUAL))
     speed = speeds(model, start(14.0, -0.4), leader, *parameters)
-    simulator, p = MemoryStepper(model, DT), model.space.unpack(model.space.defaults())
-    alone = simulator.advance(simulator.begin(start(14.0, -0.4)), leader, p)[2][:, 0]
+    stepper, p = MemoryStepper(model, DT), model.space.unpack(model.space.defaults())
+    alone = stepper.advance(stepper.begin(start(14.0, -0.4)), leader, p)[2][:, 0]
     wanted = abs(float(alone[0] - 14.0) / DT + 0.4)
     assert wanted > 0.3, "the model wants another acceleration"
     acceleration = torch.cat([torch.tensor([14.0]).double(), speed]).diff() / DT
@@ -111,8 +111,8 @@ def test_the_first_step_is_the_drivers_and_the_rest_becomes_the_models(
     with_residual = speeds(model, first, leader, *parameters, 0.2, 0.0, 0.0, 0.5, 0.2)
     assert (float(with_residual[0]) - 14.0) / DT == pytest.approx(-0.4, abs=1e-9)
     if not isinstance(model, W99):  # who never stops oscillating
-        simulator, p = MemoryStepper(model, DT), model.space.unpack(model.space.defaults())
-        alone = simulator.advance(simulator.begin(first), leader, p)[2][:, 0]
+        stepper, p = MemoryStepper(model, DT), model.space.unpack(model.space.defaults())
+        alone = stepper.advance(stepper.begin(first), leader, p)[2][:, 0]
         assert float(with_residual[-1]) == pytest.approx(float(alone[-1]), abs=0.02)
 
 
@@ -125,8 +125,8 @@ def test_no_residual_keeps_a_vehicle_from_braking_for_its_leader() -> None:
     parameters = (*model.space.defaults().tolist(), 20.0, 3.0, 0.0, 0.5, 20.0)
     wrapped = WithResidual(model)
     p = wrapped.space.unpack(torch.tensor([parameters]).double())
-    simulator = MemoryStepper(wrapped, DT)
-    _, position, speed = simulator.advance(simulator.begin(start(12.0, 1.5)), leader, p)
+    stepper = MemoryStepper(wrapped, DT)
+    _, position, speed = stepper.advance(stepper.begin(start(12.0, 1.5)), leader, p)
     assert float((speed[:1] - 12.0) / DT) == pytest.approx(1.5, abs=1e-6), "not needed yet"
     assert float(position.max()) < 60.0
     assert float(speed[100:].max()) < 1.0
@@ -178,9 +178,9 @@ def test_each_vehicle_has_its_own_residual_and_candidates_broadcast() -> None:
 
 def simulate_starts(model: WithResidual, acceleration: Tensor, leader: Leader) -> Tensor:
     begin = Start(torch.zeros_like(acceleration), 10.0 + 0 * acceleration, acceleration)
-    simulator = MemoryStepper(model, DT)
+    stepper = MemoryStepper(model, DT)
     p = model.space.unpack(model.space.defaults())
-    return simulator.advance(simulator.begin(begin), leader, p)[2]
+    return stepper.advance(stepper.begin(begin), leader, p)[2]
 
 
 def test_compiled_code_is_that_of_the_inner_model() -> None:

@@ -92,6 +92,14 @@ def test_what_a_driver_is_not_given_is_named() -> None:
         require_no_further_signals(step.agent.core.inputs, "SUMO")
 
 
+def test_a_recording_without_the_signal_is_named() -> None:
+    agent = adaptive({"name": "idm"}, further=("rain",))
+    zeros = torch.zeros(2, dtype=torch.int64)
+    dry = replace(BATCH, surroundings={})
+    with pytest.raises(DataError, match=r"reads the signal 'rain' .* a column rain_mmph"):
+        agent.burn_in(dry, zeros + 20, agent.begin(zeros))
+
+
 def test_no_platoon_is_made_up_for_a_policy_that_reads_further_signals() -> None:
     agent = adaptive({"name": "idm"}, further=("rain",))
     usual = adaptive({"name": "idm"})

@@ -113,14 +113,14 @@ def test_an_untrained_network_is_the_fixed_model(component: type[Policy]) -> Non
     torch.testing.assert_close(out, expected)
 
 
-def test_a_scaler_measures_drivers_in_parts() -> None:
+def test_a_scaler_measures_drivers_in_shards() -> None:
     """The number of drivers that are read at once changes nothing but rounding."""
     generator = torch.Generator().manual_seed(0)
     values = 3.0 + torch.randn((2, 7, 5, 3), dtype=torch.float64, generator=generator)
     mask = torch.rand((2, 7, 5), generator=generator) > 0.3
     whole = Scaler.of(values, mask)
     cuts = (slice(0, 4), slice(4, 7))
-    parts = Scaler.of_parts(lambda: [(values[:, cut], mask[:, cut]) for cut in cuts])
+    parts = Scaler.of_shards(lambda: [(values[:, cut], mask[:, cut]) for cut in cuts])
     for network in range(2):
         counted = values[network][mask[network]]
         torch.testing.assert_close(parts.mean[network], counted.mean(0))

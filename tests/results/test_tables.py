@@ -45,7 +45,7 @@ def test_the_list_of_files_says_what_each_table_holds() -> None:
     text = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
     for one in installed():
         if one.distribution == "cfx-driving":
-            assert f"| `{file_of(one)}` | {one.part.meaning}" in text, one.name
+            assert f"| `{file_of(one)}` | {one.component.meaning}" in text, one.name
 
 
 def test_a_job_writes_own_tables_those_of_its_plugins_and_those_it_names(
@@ -72,8 +72,8 @@ def test_a_table_that_a_protocol_delivers_is_written_and_read_back(tmp_path: Pat
     parts = parts_of(CENSUS, measured(census=pd.DataFrame({"drivers": [3]})))
     assert parts is not None
     assert file_of(CENSUS) == "census.parquet"
-    CENSUS.part.write(tmp_path / "census.parquet", parts)
-    assert CENSUS.part.read(tmp_path / "census.parquet").to_dict("list") == {"drivers": [3.0]}
+    CENSUS.component.write(tmp_path / "census.parquet", parts)
+    assert CENSUS.component.read(tmp_path / "census.parquet").to_dict("list") == {"drivers": [3.0]}
 
 
 def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:

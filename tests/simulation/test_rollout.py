@@ -99,11 +99,11 @@ def test_parameters_per_window(model: DrivingModel) -> None:
     leader, windows = wavy_leader(2, 24), 4
     p = candidates(model, 2, windows)
     out = simulate_follower(model, p, leader, start_of((2,)), DT, window=5)
-    simulator = MemoryStepper(model, DT, compile="never")
-    follower, speeds = simulator.begin(start_of((2,))), []
+    stepper = MemoryStepper(model, DT, compile="never")
+    follower, speeds = stepper.begin(start_of((2,))), []
     for k in range(23):  # the last window's parameters are kept for the rest
         at = Leader(*(x.T[k : k + 1] for x in leader[:3]), leader.length)
-        follower, _, speed = simulator.advance(
+        follower, _, speed = stepper.advance(
             follower, at, model.space.unpack(p[:, min(k // 5, windows - 1)])
         )
         speeds.append(speed)
@@ -267,7 +267,7 @@ def test_gradients_stay_finite_through_standstill_and_contact(model: DrivingMode
 
 @each_model
 @pytest.mark.parametrize("batch", [(7,), (1, 5), (5, 1), (3, 11), (2, 3, 4), ()], ids=str)
-def test_tiles_change_nothing(
+def test_shards_change_nothing(
     model: DrivingModel, batch: tuple[int, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     leader = wavy_leader(batch[0] if batch else 1, 13)
@@ -278,9 +278,9 @@ def test_tiles_change_nothing(
     )
     p = candidates(model, *batch)
     whole = simulate_follower(model, p, leader, start_of(batch), DT)
-    monkeypatch.setattr(rollout, "tile_size", lambda like: 4)
-    tiled = simulate_follower(model, p, leader, start_of(batch), DT)
-    assert all(torch.equal(a, b) for a, b in zip(whole, tiled, strict=True))
+    monkeypatch.setattr(rollout, "shard_size", lambda speed: 4)
+    in_shards = simulate_follower(model, p, leader, start_of(batch), DT)
+    assert all(torch.equal(a, b) for a, b in zip(whole, in_shards, strict=True))
 
 
 class Remembers(Krauss):
@@ -292,12 +292,12 @@ class Remembers(Krauss):
         return follower.memory + torch.stack([torch.ones_like(speed), speed], dim=-1)
 
 
-def test_memory_is_carried_through_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulator, leader = MemoryStepper(Remembers(), DT), wavy_leader(3, 8)
-    monkeypatch.setattr(rollout, "tile_size", lambda like: 4)
+def test_memory_is_carried_through_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    stepper, leader = MemoryStepper(Remembers(), DT), wavy_leader(3, 8)
+    monkeypatch.setattr(rollout, "shard_size", lambda speed: 4)
     in_time = Leader(*(x.T[:, :, None] for x in leader[:3]), leader.length[:, None])
     p = Krauss().space.unpack(candidates(Krauss(), 3, 5))
-    end, _, speed = simulator.advance(simulator.begin(start_of((3, 5))), in_time, p)
+    end, _, speed = stepper.advance(stepper.begin(start_of((3, 5))), in_time, p)
     torch.testing.assert_close(
         end.memory,
         torch.stack([torch.full((3, 5), 8.0, dtype=torch.float64), speed.sum(0)], dim=-1),
@@ -320,13 +320,13 @@ def fresh_compiler() -> Iterator[None]:
 @pytest.mark.usefixtures("fresh_compiler")
 def test_compiled_equals_eager_and_shapes_do_not_recompile(monkeypatch: pytest.MonkeyPatch) -> None:
     model = Krauss()
-    monkeypatch.setattr(rollout, "tile_size", lambda like: 64)
+    monkeypatch.setattr(rollout, "shard_size", lambda speed: 64)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         # PyTorch's advice to take a newer Python than 3.13.0.
         warnings.filterwarnings("ignore", "Guards may run slower", RuntimeWarning)
         # The shapes of a job: windows of many candidates, one candidate for each window, last
-        # chunks, whole drives.
+        # shards, whole drives.
         for batch, frames in (
             ((16, 128), 6),
             ((300, 1), 6),
@@ -360,7 +360,7 @@ def test_without_pythons_headers_nothing_is_compiled(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """Debian's Python has none unless python3-dev is installed."""
-    monkeypatch.setattr(rollout.shutil, "which", lambda name: f"/usr/bin/{name}")
+    monkeypatch.setattr(rollout, "find_compiler", lambda: "/usr/bin/g++")
     monkeypatch.setattr(rollout.sysconfig, "get_path", lambda name: str(tmp_path))
     assert not can_compile(torch.device("cpu"))
     (tmp_path / "Python.h").touch()
@@ -368,7 +368,7 @@ def test_without_pythons_headers_nothing_is_compiled(
 
 
 def test_without_a_compiler_it_runs_eagerly(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rollout.shutil, "which", lambda name: None)
+    monkeypatch.setattr(rollout, "find_compiler", lambda: None)
     assert not can_compile(torch.device("cpu"))
     out = simulate_follower(Krauss(), None, wavy_leader(2, 8), start_of((2,)), DT, compile="always")
     assert_same(

@@ -136,7 +136,7 @@ def test_what_was_never_a_setting_is_refused_by_its_name() -> None:
         JobConfig.of(values)
 
 
-def test_the_chunks_do_not_change_the_numbers(tmp_path: Path, error: float) -> None:
-    """The bound of memory cuts the work into chunks, and nothing else."""
+def test_shards_do_not_change_the_numbers(tmp_path: Path, error: float) -> None:
+    """The bound of memory cuts the work into shards, and nothing else."""
     few = run_job(JobConfig.of(values_of(*QUICK, "simulator.memory_mb=16")), tmp_path)
     assert few.metrics["rmse_speed/fixed"] == error

@@ -46,7 +46,7 @@ def report(result: Result, console: Console, *, verbose: bool = False) -> None:
         sentences += _undefined(compared)
     _say(sentences, console)
     for table in installed():
-        if table.name in result.tables and (verbose or table.part.always_printed):
+        if table.name in result.tables and (verbose or table.component.always_printed):
             for printed in _printed(table, evaluation, metrics):
                 console.print(printed)
     if verbose:
@@ -293,7 +293,7 @@ def described(result: Result) -> str:
         if group == "learner" and result.purpose is Purpose.CALIBRATION:
             continue
         chosen.append(f"{group} **{result.setting(f'{group}.name')}**")
-    drivers = len({pair.driver for pair in pairs})
+    drivers = len(set(pairs.drivers))
     _, words = headline(result.metrics)
     source = Path(pairs.source).name
     lines = [

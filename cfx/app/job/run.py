@@ -47,15 +47,15 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
     raise_if_signalled()  # imports swallow Ctrl-C
     data = config.data
     console = console or Console()
-    config, parts = steps.prepare(config)
+    config, components = steps.prepare(config)
     begin(folder, config)
     upload = None if config.output.url is None else Upload(config.output.url, folder)
     with tracked(config, folder) as tracker:
         if config.data != data:  # the protocol has determined other data
-            pairs = load_pairs(parts.dataset)
+            pairs = load_pairs(components.dataset)
         pairs, style = steps.select_pairs(pairs, config)
-        if parts.demo is not None:
-            parts.demo.check(pairs)
+        if components.demo is not None:
+            components.demo.check(pairs)
         tracker.set_tags(
             {
                 "dataset.fingerprint": pairs.fingerprint,
@@ -63,7 +63,7 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
                 "dataset.pairs": str(len(pairs)),
             }
         )
-        result = steps.find(steps.compose(config, parts, pairs, style), parts, config)
+        result = steps.find(steps.compose(config, components, pairs, style), components, config)
         # Figures take seconds: the numbers are there before them.
         result = result.write(
             folder, config, tell=partial(report, console=console, verbose=config.output.verbose)
@@ -85,5 +85,5 @@ def compute(config: JobConfig, pairs: PairSet) -> Result:
     """
     from cfx.app.job import steps
 
-    config, parts, context = steps.without_files(config, pairs)
-    return steps.find(context, parts, config).with_tables(config)
+    config, components, context = steps.without_files(config, pairs)
+    return steps.find(context, components, config).with_tables(config)

@@ -75,7 +75,7 @@ def calibration_tables(
         Further ones with a posterior, see `DriverPosteriors.tables`.
     """
     calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
-    elsewhere = not isinstance(context.simulator, MemoryStepper)
+    elsewhere = not isinstance(context.stepper, MemoryStepper)
     if not calibrated and settings.posterior != "none":
         log.warning(
             "calibration.posterior=%s has nothing to say: this job has calibrated no"
@@ -123,7 +123,7 @@ def _parameters(evaluation: Evaluation, method: str, ids: list[str], like: Tenso
 
 
 @dataclass(frozen=True)
-class Parts:
+class JobComponents:
     """The components of a job; making them checks the whole configuration before any work begins.
 
     The registry has checked that each is what its kind promises.
@@ -142,7 +142,7 @@ class Parts:
     demo: Demo | None = None
 
     @classmethod
-    def of(cls, config: JobConfig, protocol: Protocol) -> Parts:
+    def of(cls, config: JobConfig, protocol: Protocol) -> JobComponents:
         """Makes the components of a configuration around a protocol that is there already.
 
         Raises:
@@ -231,7 +231,7 @@ def choose_device(name: str) -> torch.device:
     return device
 
 
-def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
+def prepare(config: JobConfig) -> tuple[JobConfig, JobComponents]:
     """Makes the components, and completes the configuration by what the protocol determines.
 
     Raises:
@@ -243,17 +243,17 @@ def prepare(config: JobConfig) -> tuple[JobConfig, Parts]:
         set_threads(config.threads)
     protocol = make_protocol(config)
     config = with_signals_of_inputs(complete(config, protocol))
-    parts = Parts.of(config, protocol)
+    components = JobComponents.of(config, protocol)
     if config.calibration.posterior != "none":
         # One that is not there is named at once.
         method = posterior_method(config.calibration.posterior)
-        if not method.any_simulator and not isinstance(parts.simulator, MemorySimulator):
+        if not method.any_simulator and not isinstance(components.simulator, MemorySimulator):
             raise ConfigError(
                 f"calibration.posterior={config.calibration.posterior} simulates each trajectory"
                 " too often for any simulator but simulator=memory alone; take"
                 " calibration.posterior=laplace or sbi, or leave one of them out"
             )
-    return config, parts
+    return config, components
 
 
 def select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResult]:
@@ -284,12 +284,14 @@ def select_pairs(pairs: PairSet, config: JobConfig) -> tuple[PairSet, StyleResul
     return pairs, style
 
 
-def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult) -> ProtocolContext:
+def compose(
+    config: JobConfig, components: JobComponents, pairs: PairSet, style: StyleResult
+) -> ProtocolContext:
     """Returns what the protocol works with."""
-    bound = parts.simulator.settings.memory_mb * 2**20
-    require_memory(bound, f"simulator.memory_mb={parts.simulator.settings.memory_mb}")
+    bound = components.simulator.settings.memory_mb * 2**20
+    require_memory(bound, f"simulator.memory_mb={components.simulator.settings.memory_mb}")
     device = choose_device(config.device)
-    require_signals(parts.policy, pairs)
+    require_signals(components.policy, pairs)
     batch = PairBatch.of(pairs, dtype=getattr(torch, config.dtype), device=device)
     cache_folder: Path | str | None = None
     workspace = None
@@ -301,10 +303,10 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
             cache_folder = cache_folder.expanduser()
             workspace = cache_folder / "training"
     solver = Solver(
-        parts.simulator.stepper(parts.model, batch.dt),
-        parts.optimizer,
+        components.simulator.stepper(components.model, batch.dt),
+        components.optimizer,
         config.seed,
-        objective=parts.objective,
+        objective=components.objective,
         memory=bound,
         prior=prior_weight(config.calibration.prior),
     )
@@ -313,12 +315,12 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
         if entry.distribution == OWN:
             made = registry.create("objective", {"name": entry.name})
             reported[entry.name] = cast(Objective, made)
-    reported[config.objective["name"]] = parts.objective
+    reported[config.objective["name"]] = components.objective
     calibrator = Calibrator(
         solver,
         cache=Cache(cache_folder),
         reported=reported,
-        engine=parts.engine,
+        engine=components.engine,
     )
     return ProtocolContext(
         pairs=pairs,
@@ -327,41 +329,43 @@ def compose(config: JobConfig, parts: Parts, pairs: PairSet, style: StyleResult)
         model_node=config.model,
         policy_node=config.policy,
         calibrator=calibrator,
-        policy=parts.policy.for_model(parts.model, batch.dt, config.windows),
-        learner=parts.learner,
+        policy=components.policy.for_model(components.model, batch.dt, config.windows),
+        learner=components.learner,
         windows=config.windows,
         split=config.split,
         workspace=workspace,
-        metrics=parts.metrics,
+        metrics=components.metrics,
     )
 
 
-def without_files(config: JobConfig, pairs: PairSet) -> tuple[JobConfig, Parts, ProtocolContext]:
+def without_files(
+    config: JobConfig, pairs: PairSet
+) -> tuple[JobConfig, JobComponents, ProtocolContext]:
     """Returns what a protocol works with, where a job keeps no cache and writes nothing.
 
     Raises:
         CfxError: a setting is wrong, or what a component needs is not there.
     """
-    config, parts = prepare(config)
+    config, components = prepare(config)
     pairs, style = select_pairs(pairs, config)
     uncached = JobConfig.of({**config.model_dump(), "cache": {"enabled": False}})
-    return config, parts, compose(uncached, parts, pairs, style)
+    return config, components, compose(uncached, components, pairs, style)
 
 
-def find(context: ProtocolContext, parts: Parts, config: JobConfig) -> Result:
+def find(context: ProtocolContext, components: JobComponents, config: JobConfig) -> Result:
     """Runs the protocol; returns what it has delivered, with tables of the calibration.
 
     Raises:
         PluginError: it delivers no `ProtocolResult`.
     """
-    with closing(context.simulator), closing(parts.engine):
-        delivered: object = parts.protocol.run(context)
+    with closing(context.stepper), closing(components.engine):
+        delivered: object = components.protocol.run(context)
         if not isinstance(delivered, ProtocolResult):
             raise PluginError(
-                f"{registry.origin(parts.protocol)}: run must return a cfx.plugin.ProtocolResult,"
-                f" but returned a {type(delivered).__name__}"
+                f"{registry.origin(components.protocol)}: run must return a"
+                f" cfx.plugin.ProtocolResult, but returned a {type(delivered).__name__}"
             )
-        purpose = Purpose.of(parts.model, parts.policy)
+        purpose = Purpose.of(components.model, components.policy)
         evaluation = replace(delivered.evaluation, purpose=purpose).distinct_methods()
         tables = calibration_tables(context, evaluation, config.calibration)
     if "slices" in tables:
@@ -379,7 +383,7 @@ def find(context: ProtocolContext, parts: Parts, config: JobConfig) -> Result:
     return Result.of(
         evaluation,
         config=config.model_dump(mode="json"),
-        data=description(context.pairs, delivered, config, parts),
+        data=description(context.pairs, delivered, config, components),
         metrics=metrics,
         trained=delivered.policy,
     )
@@ -399,7 +403,7 @@ def job_tables(
 
 
 def description(
-    pairs: PairSet, delivered: ProtocolResult, config: JobConfig, parts: Parts
+    pairs: PairSet, delivered: ProtocolResult, config: JobConfig, components: JobComponents
 ) -> dict[str, Any]:
     """Returns what `data.json` says of the data and the job; the evaluation says the rest."""
     dropped = []
@@ -411,7 +415,7 @@ def description(
         "pairs": len(pairs),
         "protocol": dict(delivered.notes),
         "dropped": dropped,
-        "objective": {"name": config.objective["name"], "unit": parts.objective.unit},
+        "objective": {"name": config.objective["name"], "unit": components.objective.unit},
         "cfx": version(),
         "commit": commit(Path.cwd()),
     }

@@ -11,7 +11,7 @@ import pandas as pd
 from pydantic import Field, model_validator
 from torch import Tensor
 
-from cfx.calibration.calibrator import Labels
+from cfx.calibration.calibrator import WindowLabels
 from cfx.core.component import Distinct, Settings
 from cfx.data.pairs import PairSet
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
@@ -108,7 +108,7 @@ class _Calibrated:
     population: Tensor
     start: Tensor
     base: Tensor | None
-    labels: Labels | None
+    labels: WindowLabels | None
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Trained:
     test: HeldOut
     fold: Tensor | None
     curves: pd.DataFrame
-    labels: Labels | None
+    labels: WindowLabels | None
     notes: Mapping[str, Any]
     calibration: Mapping[str, float]
 
@@ -224,7 +224,11 @@ class AcrossDrivers(Protocol):
         return assign_folds(pairs, s.folds, s.together, s.min_test_duration, seed=seed)
 
     def _calibrated(
-        self, context: ProtocolContext, fixed: Tensor, population: Tensor, labels: Labels | None
+        self,
+        context: ProtocolContext,
+        fixed: Tensor,
+        population: Tensor,
+        labels: WindowLabels | None,
     ) -> _Calibrated:
         """Returns what was calibrated, with what policies start from."""
         s = self.settings
@@ -233,7 +237,7 @@ class AcrossDrivers(Protocol):
             start = context.defaults(population).expand_as(population)
         base = None
         if s.base == "own":
-            space = context.simulator.model.adaptation_space
+            space = context.stepper.model.adaptation_space
             base = shrunk(space, fixed, s.shrinkage)
         return _Calibrated(fixed, population, start, base, labels)
 

@@ -14,7 +14,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.calibration.calibrator import Calibrator, Labels
+from cfx.calibration.calibrator import Calibrator, WindowLabels
 from cfx.calibration.objectives import Objective
 from cfx.core import registry
 from cfx.core.component import Component
@@ -82,9 +82,9 @@ class ProtocolContext:
     metrics: MetricSet | None = None
 
     @property
-    def simulator(self) -> Stepper:
+    def stepper(self) -> Stepper:
         """The driving model and its time step."""
-        return self.calibrator.solver.simulator
+        return self.calibrator.solver.stepper
 
     @property
     def seed(self) -> int:
@@ -94,7 +94,7 @@ class ProtocolContext:
     @property
     def space(self) -> ParameterSpace:
         """The driving model's parameters."""
-        return self.simulator.model.space
+        return self.stepper.model.space
 
     @property
     def objective(self) -> Objective:
@@ -111,7 +111,7 @@ class ProtocolContext:
         """`TrainedOn.quantiles` of all agents here."""
         return recorded_quantiles(self.batch)
 
-    def labels(self, counts: Tensor, fixed: Tensor) -> Labels | None:
+    def labels(self, counts: Tensor, fixed: Tensor) -> WindowLabels | None:
         """Calibrates parameters per window (labels), if the learner needs any.
 
         Args:
@@ -160,18 +160,18 @@ class ProtocolContext:
         if not self.policy.trainable:
             return
         learned_from = LearnedFrom(self.learner.learned_before)
-        known = [pair.pair_id for pair in tested if pair in learned_from]
-        if known:
+        not_new = tested.select([pair in learned_from for pair in tested], "learned from").ids
+        if not_new:
             raise DataError(
-                f"learner.start: that policy has learned from {len(known)} of the {len(tested)}"
-                f" pairs that are tested here, the first of them '{known[0]}'; test on others"
+                f"learner.start: that policy has learned from {len(not_new)} of the {len(tested)}"
+                f" pairs that are tested here, the first of them '{not_new[0]}'; test on others"
                 " (data.recording, data.pair_ids)"
             )
 
     def training_data(self, pairs: TrainingPairs, names: tuple[str, ...]) -> TrainingData:
         """Returns what the learner is given: some of the pairs, and a name for each network."""
         return TrainingData(
-            simulator=self.simulator,
+            stepper=self.stepper,
             recorded=self.batch,
             pairs=pairs,
             windows=self.windows,
@@ -184,7 +184,7 @@ class ProtocolContext:
 
     def simulated(self, agent: Agent, followers: Followers, first: Tensor) -> ClosedLoop:
         """Simulates followers from frames `first` on; see `simulate_in_shards`."""
-        return simulate_in_shards(self.engine, self.simulator, agent, followers, first)
+        return simulate_in_shards(self.engine, self.stepper, agent, followers, first)
 
     def compared(
         self,
@@ -223,7 +223,7 @@ class ProtocolContext:
 
         They are in double precision, so that constants stay what calibration found.
         """
-        space = self.simulator.model.space
+        space = self.stepper.model.space
         width = token_width(policy.inputs, policy.summary, self.windows.length)
         unit = space.to_unit(parameters.cpu())
         network = policy.build(
@@ -261,7 +261,7 @@ class ProtocolContext:
             model_node=self.model_node,
             policy_node=self.policy_node,
             windows=self.windows,
-            dt=self.simulator.dt,
+            dt=self.stepper.dt,
             names=names,
             base=training_result.base,
             trained_on=TrainedOn(learned_from, self._quantiles),
@@ -278,7 +278,7 @@ class ProtocolContext:
                 f"{registry.origin(self.learner)} breaks its contract: there is no head '{name}';"
                 f" write one of {', '.join(registry.names('head'))}"
             )
-        model = self.simulator.model
+        model = self.stepper.model
         head = head_class(name).for_model(model, training_result.scaler.mean.device)
         if policy.trainable and head.model_space != model.adaptation_space:
             log.info(
@@ -306,7 +306,7 @@ class ProtocolResult:
     evaluation: Evaluation
     policy: Agent
     curves: pd.DataFrame
-    labels: Labels | None
+    labels: WindowLabels | None
     notes: Mapping[str, Any] = field(default_factory=dict)
     calibration: Mapping[str, float] = field(default_factory=dict)
 

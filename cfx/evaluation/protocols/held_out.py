@@ -135,8 +135,8 @@ class HeldOut:
         loops = {"fixed": loops["fixed"], "alone": alone, "policy": loops["policy"]}
         table = pd.DataFrame(
             {
-                "pair_id": [pair.pair_id for pair in self.pairs],
-                "driver": [pair.driver for pair in self.pairs],
+                "pair_id": self.pairs.ids,
+                "driver": self.pairs.drivers,
                 "share": share,
                 "past_rmse_speed_fixed": np.sqrt(past.fixed),
                 "past_rmse_speed_alone": np.sqrt(past.policy),
@@ -178,7 +178,7 @@ class HeldOut:
             agents[name] = (agent, self.policy.names)
         default = context.constant(DefaultPolicy(), context.defaults(self.fixed)[None])
         agents["default"] = (default, ("any",))
-        return measure_platoons(context.simulator.model, agents)
+        return measure_platoons(context.stepper.model, agents)
 
     def history(self, histories: Sequence[float], fixed: ClosedLoop) -> pd.DataFrame:
         """Simulates the test part after different amounts of history.
@@ -208,7 +208,7 @@ class HeldOut:
         followers = Followers(self.batch, self.network, base, amount)
         loop = context.simulated(self.policy, followers, self.first)
         speed, gap = closed_loop_errors(self.batch, self.first, loop)
-        observed = self.first.cpu().numpy() * context.simulator.dt
+        observed = self.first.cpu().numpy() * context.stepper.dt
         text = f"{100 * context.split:.0f} %"
         if amount is not None:
             observed = np.minimum(observed, amount)
@@ -217,8 +217,8 @@ class HeldOut:
         np.divide(error_of_fixed - speed, error_of_fixed, out=improvement, where=error_of_fixed > 0)
         return pd.DataFrame(
             {
-                "pair_id": [pair.pair_id for pair in self.pairs],
-                "driver": [pair.driver for pair in self.pairs],
+                "pair_id": self.pairs.ids,
+                "driver": self.pairs.drivers,
                 "history_s": observed,
                 "amount": text,
                 "rmse_speed": speed,

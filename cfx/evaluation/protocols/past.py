@@ -119,7 +119,7 @@ def past_errors(
         if policy.base is not None and policy.context_rule.driver_specific:
             base = base_of(policy, early)[:, : early.shape[1]]
         each = torch.arange(len(rows), device=rows.device)
-        model = context.simulator.model
+        model = context.stepper.model
         residual = policy.core.head.driven_model(model) is not model
 
         def errors(agent: Agent, followers: Followers) -> Tensor:

@@ -70,7 +70,7 @@ class WithinDriver(Protocol):
                 fixed=fixed,
                 base=fixed if self.settings.networks == "all" else None,
                 labels=labels,
-                drivers=tuple(pair.driver for pair in pairs),
+                drivers=tuple(pairs.drivers),
             )
             training_data = context.training_data(training_pairs, names)
             training_result = context.learner.fit(context.policy, training_data)
@@ -97,7 +97,7 @@ class WithinDriver(Protocol):
             network, names = group_by([ANY_DRIVER] * len(pairs))
             return network.to(device), names
         network = torch.arange(len(pairs), device=device)
-        return network, tuple(pair.pair_id for pair in pairs)
+        return network, tuple(pairs.ids)
 
     def _platoons(self, context: ProtocolContext, policy: Agent, fixed: Tensor) -> Platoon | None:
         """Simulates platoons where one network drives any driver; otherwise None."""
@@ -105,7 +105,7 @@ class WithinDriver(Protocol):
             return None
         default = context.constant(DefaultPolicy(), fixed[:1])
         agents = {"default": (default, ("any",)), "policy": (policy, policy.names)}
-        return measure_platoons(context.simulator.model, agents)
+        return measure_platoons(context.stepper.model, agents)
 
 
 def _test_part(

@@ -9,7 +9,7 @@ features, c = n + k features of conditioning.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import NamedTuple
 
@@ -77,8 +77,19 @@ class RolloutBatch(NamedTuple):
 
     def each(self, change: Callable[[Tensor], Tensor]) -> RolloutBatch:
         """Returns the trajectories with each table `(N, D)` changed alike."""
-        changed = {name: change(v) for name, v in self._asdict().items() if v is not None}
+        changed = {}
+        for name, table in self._asdict().items():
+            if table is not None:
+                changed[name] = change(table)
         return self._replace(**changed)
+
+    def repeated(self, times: int) -> RolloutBatch:
+        """Returns all trajectories so many times, each time behind the one before."""
+
+        def of_all(values: Tensor) -> Tensor:
+            return values.repeat(1, times)
+
+        return self.each(of_all)
 
     def without_unweighted(self) -> RolloutBatch:
         """Returns the trajectories that have weight, in order.
@@ -89,7 +100,11 @@ class RolloutBatch(NamedTuple):
         most = int(has_weight.sum(1).max())
         order = has_weight.long().argsort(dim=1, descending=True, stable=True)
         kept = order[:, :most].sort(1).values
-        return self.each(lambda values: values.gather(1, kept))
+
+        def of_kept(values: Tensor) -> Tensor:
+            return values.gather(1, kept)
+
+        return self.each(of_kept)
 
 
 class Conditioning(NamedTuple):
@@ -107,8 +122,13 @@ class Conditioning(NamedTuple):
     features: Tensor
 
 
-class Part(NamedTuple):
-    """Some of all networks of a training: which these are, and how many there are in all."""
+class NetworkShard(NamedTuple):
+    """Some of all networks of a training.
+
+    Attributes:
+        networks: which these are.
+        total: how many there are in all.
+    """
 
     networks: slice
     total: int
@@ -135,7 +155,13 @@ class Recordings:
 
     def __getitem__(self, rows: Tensor) -> Recordings:
         """Returns some of the pairs."""
-        return Recordings(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Recordings(
+            self.batch[rows],
+            self.pair[rows],
+            self.tokens[rows],
+            self.driver_features[rows],
+            self.time_gap[rows],
+        )
 
 
 @dataclass
@@ -155,7 +181,7 @@ class RolloutDataset:
         scaler: normalises tokens and conditioning, f + c features; alike for all members of an
             ensemble.
         ensemble_size: networks of an ensemble, which stand behind one another.
-        part: which of all networks of the training these are; None: all.
+        shard: which of all networks of the training these are; None: all.
     """
 
     recordings: Recordings
@@ -169,7 +195,7 @@ class RolloutDataset:
     scaler: Scaler
     chance: Tensor | None = None
     ensemble_size: int = 1
-    part: Part | None = None
+    shard: NetworkShard | None = None
 
     @classmethod
     def of(
@@ -190,7 +216,7 @@ class RolloutDataset:
                 how evenly drivers are sampled.
             generator: chooses the drivers for validation, for each member of an ensemble anew.
         """
-        share, ensemble_size = settings.validation, settings.ensemble_size
+        ensemble_size = settings.ensemble_size
         recorded, row = _recorded_once(training_data)
         batch = _single_precision(training_data.recorded, training_data.pairs.index[recorded])
         device = batch.lengths.device
@@ -201,12 +227,17 @@ class RolloutDataset:
         present = grid.scatter(torch.ones_like(pairs)).bool().repeat_interleave(ensemble_size, 0)
         pooled = grid.mean(space.to_unit(fixed)).float()
         last = training_data.pairs.split.frame.to(device)[pair]
-        kept, few = _validation_drivers(training_data, pair.cpu(), present.cpu(), share, generator)
+        validation = settings.validation
+        kept, few = _validation_drivers(
+            training_data, pair.cpu(), present.cpu(), validation, generator
+        )
         kept, few = kept.to(device), few.to(device)[:, None]
         trains = present & (few | ~kept)
-        until = torch.where(few, (last * (1.0 - share)).long(), last)
-        base = training_data.pairs.base
-        base = space.to_unit(fixed if base is None else head.completed(base)).float()
+        until = torch.where(few, (last * (1.0 - validation)).long(), last)
+        bases = fixed
+        if training_data.pairs.base is not None:
+            bases = head.completed(training_data.pairs.base)
+        base = space.to_unit(bases).float()
         frame = training_data.pairs.split.frame.to(device)[recorded]
         seen = _measured_tokens(training_data, policy, batch, frame)
         driver_features = _driver_features(training_data, policy, batch, frame)
@@ -223,7 +254,7 @@ class RolloutDataset:
             recordings=Recordings(batch, recorded, seen, driver_features, time_gap),
             pair=of_driver,
             trains=trains,
-            validates=present & (few | kept) & (share > 0),
+            validates=present & (few | kept) & (validation > 0),
             until=until,
             last=last,
             base=placed,
@@ -245,15 +276,22 @@ class RolloutDataset:
         recordings = self.recordings
         if len(rows) < len(recordings.pair):
             recordings = recordings[rows]
-        tables = ("trains", "validates", "until", "last", "base", "pooled")
+        chance = self.chance
+        if chance is not None:
+            chance = chance[networks]
         return replace(
             self,
-            **{name: getattr(self, name)[networks] for name in tables},
             recordings=recordings,
             pair=pair,
-            chance=None if self.chance is None else self.chance[networks],
+            trains=self.trains[networks],
+            validates=self.validates[networks],
+            until=self.until[networks],
+            last=self.last[networks],
+            base=self.base[networks],
+            pooled=self.pooled[networks],
+            chance=chance,
             scaler=Scaler(self.scaler.mean[networks], self.scaler.scale[networks]),
-            part=Part(networks, len(self.pair)),
+            shard=NetworkShard(networks, len(self.pair)),
         )
 
     def uniform(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
@@ -272,7 +310,9 @@ class RolloutDataset:
     def _drawn(
         self, draw: Callable[..., Tensor], shape: tuple[int, ...], generator: torch.Generator
     ) -> Tensor:
-        networks, total = self.part or Part(slice(None), len(self.pair))
+        networks, total = self.shard or NetworkShard(slice(None), len(self.pair))
+        # Drawn for all networks of the training, so that a network's numbers do not depend on which
+        # others stand beside it.
         return draw((total, *shape), generator=generator)[networks].to(self.pair.device)
 
     def for_base(self, base: Tensor) -> RolloutDataset:
@@ -303,7 +343,9 @@ class RolloutDataset:
         """
         networks, drivers = self.pair.shape
         if self.chance is not None:
-            count = drivers if most is None else min(most, drivers)
+            count = drivers
+            if most is not None:
+                count = min(most, drivers)
             return self._draw(torch.where(self.trains, self.chance, 0.0), count, generator)
         if most is None or drivers <= most:
             return torch.arange(drivers, device=self.pair.device).expand(networks, drivers)
@@ -320,19 +362,22 @@ class RolloutDataset:
             count = min(most, count)
         return self._sample(self.validates, count, generator)
 
-    def _sample(self, wanted: Tensor, count: int, generator: torch.Generator) -> Tensor:
-        """Samples `count` places of each network, `(N, count)`, in order.
+    def _sample(self, preferred: Tensor, count: int, generator: torch.Generator) -> Tensor:
+        """Samples `count` places of each network without replacement, `(N, count)`, in order.
 
-        Those that are wanted, bool `(N, B)`, are taken first; others follow where they are too few.
+        Preferred ones, bool `(N, B)`, are taken first; others follow where they are too few.
         """
-        draws = self.uniform(tuple(wanted.shape[1:]), generator)
-        return torch.where(wanted, draws, -1.0).topk(count, dim=1).indices.sort(1).values
+        # The greatest of uniform numbers are a sample; -1 stands behind all of them.
+        draws = self.uniform(tuple(preferred.shape[1:]), generator)
+        return torch.where(preferred, draws, -1.0).topk(count, dim=1).indices.sort(1).values
 
     def _draw(self, chance: Tensor, count: int, generator: torch.Generator) -> Tensor:
         """Draws `count` places of each network with replacement, `(N, count)`, in order."""
+        # The inverse of the cumulative distribution at uniform numbers.
         upto = chance.cumsum(1)
         draws = self.uniform((count,), generator) * upto[:, -1:]
         places = torch.searchsorted(upto, draws, right=True)
+        # Rounding of the sum may put a number behind the last place that has a chance.
         last = (chance > 0).long().cumsum(1).argmax(1, keepdim=True)
         return places.minimum(last).sort(1).values
 
@@ -369,8 +414,8 @@ class RolloutDataset:
         if count > 0:
             measured = self.recordings.driver_features[pair]
             usual = self.scaler.mean[:, None, -count:]
-            known = torch.where(cold_start | measured.isnan(), usual, measured)
-            features = torch.cat([features, known], -1)
+            read = torch.where(cold_start | measured.isnan(), usual, measured)
+            features = torch.cat([features, read], -1)
         return Conditioning(pair, base, features)
 
 
@@ -388,20 +433,22 @@ def chances(sites: Sequence[str], drivers: Sequence[str], frames: Tensor, balanc
         frames: of each pair, `(P,)`.
         balance: from 0 (every pair alike) to 1.
     """
-    of_site = np.unique(np.asarray(sites), return_inverse=True)[1]
-    who = np.unique(np.asarray(drivers), return_inverse=True)[1]
-    _, first, of_driver = np.unique(
-        of_site * len(who) + who, return_index=True, return_inverse=True
+    site_of_pair = np.unique(np.asarray(sites), return_inverse=True)[1]
+    name_of_pair = np.unique(np.asarray(drivers), return_inverse=True)[1]
+    # A number for each driver at each site, and a pair of each of them.
+    _, first_pair, driver_of_pair = np.unique(
+        site_of_pair * len(name_of_pair) + name_of_pair, return_index=True, return_inverse=True
     )
-    own = frames.double().numpy() ** balance
-    total = np.bincount(of_driver, own)
-    site = of_site[first]
-    shared = total ** (1.0 - balance)
-    of_sites = np.bincount(site, shared)
-    share = of_sites ** (1.0 - balance)
-    share = share / share.sum()
-    chance = share[of_site] * (shared / of_sites[site])[of_driver] * own / total[of_driver]
-    return torch.as_tensor(chance)
+    site_of_driver = site_of_pair[first_pair]
+    pair_weight = frames.double().numpy() ** balance
+    driver_total = np.bincount(driver_of_pair, pair_weight)
+    driver_weight = driver_total ** (1.0 - balance)
+    site_total = np.bincount(site_of_driver, driver_weight)
+    site_weight = site_total ** (1.0 - balance)
+    # P(site) P(driver | site) P(pair | driver)
+    of_site = (site_weight / site_weight.sum())[site_of_pair]
+    of_driver = (driver_weight / site_total[site_of_driver])[driver_of_pair]
+    return torch.as_tensor(of_site * of_driver * pair_weight / driver_total[driver_of_pair])
 
 
 def _chance(
@@ -413,13 +460,18 @@ def _chance(
     drivers = training_data.pairs.known_drivers
     sites = training_data.pairs.sites or ("",) * len(drivers)
     frames = training_data.pairs.split.frame.cpu()
-    found = torch.zeros(pair.shape, dtype=torch.float64)
+    chance = torch.zeros(pair.shape, dtype=torch.float64)
     for network, row in enumerate(pair.cpu()):
-        own = row[present[network].cpu()].tolist()
-        found[network, present[network].cpu()] = chances(
-            [sites[one] for one in own], [drivers[one] for one in own], frames[own], balance
+        places = present[network].cpu()
+        pairs = row[places].tolist()
+        sites_of_network, drivers_of_network = [], []
+        for number in pairs:
+            sites_of_network.append(sites[number])
+            drivers_of_network.append(drivers[number])
+        chance[network, places] = chances(
+            sites_of_network, drivers_of_network, frames[pairs], balance
         )
-    return found.to(pair.device)
+    return chance.to(pair.device)
 
 
 def _recorded_once(training_data: TrainingData) -> tuple[Tensor, Tensor]:
@@ -432,11 +484,12 @@ def _recorded_once(training_data: TrainingData) -> tuple[Tensor, Tensor]:
         Which of the P pairs these are, `(U,)`, and which one of these stands for each, `(P,)`.
     """
     frame = training_data.pairs.split.frame.to(training_data.device)
-    marks = torch.stack([training_data.pairs.index.to(frame), frame], 1)
-    _, group = torch.unique(marks, dim=0, return_inverse=True)
-    number = torch.arange(len(group), device=group.device)
-    first = torch.full_like(number, len(group)).scatter_reduce(0, group, number, "amin")
-    recorded, row = torch.unique(first[group], return_inverse=True)
+    recording_and_end = torch.stack([training_data.pairs.index.to(frame), frame], 1)
+    _, equals = torch.unique(recording_and_end, dim=0, return_inverse=True)
+    number = torch.arange(len(equals), device=equals.device)
+    # The first of those that are equal stands for all of them.
+    first = torch.full_like(number, len(equals)).scatter_reduce(0, equals, number, "amin")
+    recorded, row = torch.unique(first[equals], return_inverse=True)
     return recorded, row
 
 
@@ -456,20 +509,20 @@ def usual_time_gaps(batch: PairBatch, last: Tensor, pair: Tensor) -> Tensor:
         pair: which of the P pairs these are, `(U,)`.
     """
     frames = torch.arange(batch.mask.shape[1], device=last.device)
-    found = []
-    for part in _parts(len(pair)):
-        some = batch[pair[part]]
-        moves = (frames <= last[part, None]) & (some.follower_speed > _MOVING_MPS)
-        time_gap = (some.gap - _STANDSTILL_M) / some.follower_speed.clamp(min=_MOVING_MPS)
-        found.append(torch.where(moves, time_gap, torch.nan).nanmedian(1).values)
-    return torch.cat(found).nan_to_num(_TIME_GAPS_S[0]).clamp(*_TIME_GAPS_S)
+    medians = []
+    for shard in _shards_of_pairs(len(pair)):
+        pairs = batch[pair[shard]]
+        moves = (frames <= last[shard, None]) & (pairs.follower_speed > _MOVING_MPS)
+        time_gap = (pairs.gap - _STANDSTILL_M) / pairs.follower_speed.clamp(min=_MOVING_MPS)
+        medians.append(torch.where(moves, time_gap, torch.nan).nanmedian(1).values)
+    return torch.cat(medians).nan_to_num(_TIME_GAPS_S[0]).clamp(*_TIME_GAPS_S)
 
 
 def _validation_drivers(
     training_data: TrainingData,
     pair: Tensor,
     present: Tensor,
-    share: float,
+    validation: float,
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
     """Chooses validation drivers for each network; all pairs of a driver stay together.
@@ -485,13 +538,13 @@ def _validation_drivers(
         driver_at = {}
         for place in places:
             driver_at[place] = drivers[int(pair[network, place])]
-        known = sorted(set(driver_at.values()))
-        few[network] = len(known) < _FEW_DRIVERS
-        if few[network] or share == 0:
+        names = sorted(set(driver_at.values()))
+        few[network] = len(names) < _FEW_DRIVERS
+        if few[network] or validation == 0:
             continue
-        count = max(1, round(share * len(known)))
-        order = torch.randperm(len(known), generator=generator)[:count]
-        chosen = {known[index] for index in order.tolist()}
+        count = max(1, round(validation * len(names)))
+        order = torch.randperm(len(names), generator=generator)[:count]
+        chosen = {names[index] for index in order.tolist()}
         for place, driver in driver_at.items():
             kept[network, place] = driver in chosen
     return kept, few
@@ -505,8 +558,8 @@ def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
         shape = (len(pair), signal.shape[1])
         values = torch.as_tensor(memory.empty(shape, np.float32, together=together))
         values = values.to(signal.device)
-        for part in _parts(len(pair)):
-            values[part] = signal[pair[part]].float()
+        for shard in _shards_of_pairs(len(pair)):
+            values[shard] = signal[pair[shard]].float()
             memory.release()
         return values
 
@@ -520,7 +573,7 @@ def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
     )
 
 
-def _parts(pairs: int) -> Iterator[slice]:
+def _shards_of_pairs(pairs: int) -> Iterator[slice]:
     """Yields which pairs are read at once."""
     for first in range(0, pairs, _PAIRS_AT_ONCE):
         yield slice(first, min(first + _PAIRS_AT_ONCE, pairs))
@@ -534,17 +587,17 @@ def _measured_tokens(
     end = int(last.max()) + 1
     windows = torch.arange(0, end, training_data.windows.stride, device=device)
     inputs = policy_inputs(policy.inputs)
-    found = torch.empty(0)
-    for part in _parts(len(batch)):
-        pairs = torch.arange(part.start, part.stop, device=device)[:, None]
+    of_all_pairs = torch.empty(0)
+    for shard in _shards_of_pairs(len(batch)):
+        pairs = torch.arange(shard.start, shard.stop, device=device)[:, None]
         history = measured_history(batch, pairs, windows, training_data.windows.length)
-        own = tokens(history, inputs, policy.summary)
-        if part.start == 0:
-            room = memory.empty((len(batch), *own.shape[1:]), np.float32)
-            found = torch.as_tensor(room).to(device)
-        found[part] = own
+        of_shard = tokens(history, inputs, policy.summary)
+        if shard.start == 0:
+            room = memory.empty((len(batch), *of_shard.shape[1:]), np.float32)
+            of_all_pairs = torch.as_tensor(room).to(device)
+        of_all_pairs[shard] = of_shard
         memory.release()
-    return found
+    return of_all_pairs
 
 
 def _driver_features(
@@ -554,7 +607,7 @@ def _driver_features(
     if not policy.driver_features:
         return until.new_empty((len(batch), 0), dtype=torch.float32)
     since = torch.zeros_like(until)
-    dt = training_data.simulator.dt
+    dt = training_data.stepper.dt
     return measure(batch, policy.driver_features, dt, since, until).float()
 
 
@@ -571,26 +624,28 @@ def _scaler(
         counted: windows that are trained on, bool `(E, B, W)`.
     """
     windows = seen.shape[1]
-    known = driver_features.isnan().logical_not().all(-1)
+    # A driver of whom a feature is unknown does not count in any of them.
+    measured = driver_features.isnan().logical_not().all(-1)
 
-    def of_base(number: int) -> _Values:
-        for part in _parts(pair.shape[1]):
-            own = pair[number, part]
-            center = squashed(base[number, part])[:, None].expand(-1, windows, -1)
-            yield torch.cat([seen[own], center], -1)[None], counted[number, part][None]
+    def tokens_and_bases(ensemble: int) -> _Values:
+        for shard in _shards_of_pairs(pair.shape[1]):
+            pairs = pair[ensemble, shard]
+            center = squashed(base[ensemble, shard])[:, None].expand(-1, windows, -1)
+            yield torch.cat([seen[pairs], center], -1)[None], counted[ensemble, shard][None]
             memory.release()
 
-    def of_driver(number: int) -> _Values:
-        for part in _parts(pair.shape[1]):
-            own = pair[number, part]
-            values = driver_features[own].nan_to_num()[:, None].expand(-1, windows, -1)
-            yield values[None], (counted[number, part] & known[own][:, None])[None]
+    def features_of_drivers(ensemble: int) -> _Values:
+        for shard in _shards_of_pairs(pair.shape[1]):
+            pairs = pair[ensemble, shard]
+            values = driver_features[pairs].nan_to_num()[:, None].expand(-1, windows, -1)
+            yield values[None], (counted[ensemble, shard] & measured[pairs][:, None])[None]
 
     means, scales = [], []
-    for number in range(len(pair)):
-        found = [Scaler.of_parts(partial(of, number)) for of in (of_base, of_driver)]
-        means.append(torch.cat([one.mean for one in found], -1))
-        scales.append(torch.cat([one.scale for one in found], -1))
+    for ensemble in range(len(pair)):
+        first = Scaler.of_shards(partial(tokens_and_bases, ensemble))
+        second = Scaler.of_shards(partial(features_of_drivers, ensemble))
+        means.append(torch.cat([first.mean, second.mean], -1))
+        scales.append(torch.cat([first.scale, second.scale], -1))
     return Scaler(torch.cat(means), torch.cat(scales))
 
 

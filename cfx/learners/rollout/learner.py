@@ -107,16 +107,16 @@ class RolloutLearner(Learner):
         Raises:
             ConfigError: the simulator or the model has no gradients.
         """
-        simulator, s = training_data.simulator, self.settings
+        stepper, s = training_data.stepper, self.settings
         if policy.adapts:
-            self.require_gradients(simulator.model, simulator.differentiable)
+            self.require_gradients(stepper.model, stepper.differentiable)
         if not {"gap", "time_headway"} & set(policy.inputs):
             log.info(
                 "The policy does not see the gap; policy.inputs=situation gives smaller errors"
             )
         training_data = with_simulated_drivers(training_data, s.simulated_drivers)
         generator = torch.Generator().manual_seed(training_data.seed)
-        head = head_class(s.head).for_model(simulator.model)
+        head = head_class(s.head).for_model(stepper.model)
         dataset = RolloutDataset.of(training_data, policy, head, s, generator)
         network = untrained(policy, dataset, head, generator)
         start = None
@@ -177,12 +177,15 @@ class RolloutLearner(Learner):
         in_order = [trained[number] for number in range(count)]
         weights = {}
         for name in network.state_dict():
-            weights[name] = torch.cat([found.weights[name] for found in in_order])
+            weights[name] = torch.cat([shard.weights[name] for shard in in_order])
         network.load_state_dict(weights)
-        curves = pd.concat([found.curves for found in in_order], ignore_index=True)
+        curves = pd.concat([shard.curves for shard in in_order], ignore_index=True)
         curves = curves.sort_values("epoch", kind="stable", ignore_index=True)
         warn_of_nothing_learned(curves)
-        factors = [found.dispersion for found in in_order if found.dispersion is not None]
+        factors = []
+        for shard in in_order:
+            if shard.dispersion is not None:
+                factors.append(shard.dispersion)
         dispersion = None
         if factors:
             # The geometric mean of an ensemble's members.
@@ -205,7 +208,9 @@ def start_policy(start: str) -> Agent:
         DataError: there is no such policy, or none with such a network.
     """
     place, _, name = start.partition("#")
-    folder = folder_of_ready_made(place) if is_ready_made(place) else Path(place).expanduser()
+    folder = Path(place).expanduser()
+    if is_ready_made(place):
+        folder = folder_of_ready_made(place)
     try:
         agent = saved.load_agent(folder / "policy")
         if not name:
@@ -225,7 +230,7 @@ def check_start(
     Raises:
         ConfigError: the policy, the model, the head, windows or the time step are others.
     """
-    model, windows = training_data.simulator.model, training_data.windows
+    model, windows = training_data.stepper.model, training_data.windows
     unlike: list[tuple[str, object]] = []
     if agent.core.policy.identity() != policy.identity():
         unlike.append(("policy", agent.policy_node))
@@ -236,7 +241,7 @@ def check_start(
         unlike.append(("learner.head", agent.core.head.name))
     if agent.windows != windows:
         unlike.append(("windows", agent.windows.model_dump()))
-    if abs(agent.dt - training_data.simulator.dt) > 1e-6:
+    if abs(agent.dt - training_data.stepper.dt) > 1e-6:
         unlike.append(("data.time_step", agent.dt))
     if unlike:
         key, value = unlike[0]
@@ -270,7 +275,11 @@ def begun(
     weights: dict[str, Tensor] = {}
     for name, value in agent.core.network.state_dict().items():
         repeated = value.repeat(len(dataset.pair) // size, *[1] * (value.dim() - 1))
-        weights[name.removeprefix("members.") if size > 1 else name] = repeated
+        key = name
+        if size > 1:
+            # Trained one by one, networks are not yet the members of an ensemble.
+            key = name.removeprefix("members.")
+        weights[key] = repeated
     network.load_state_dict(weights)
     mean, scale = agent.core.scaler.mean, agent.core.scaler.scale
     networks = len(dataset.pair)

@@ -19,13 +19,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from cfx.learners.rollout.dataset import Conditioning, RolloutBatch, RolloutDataset
-from cfx.learners.rollout.scan import Scan
 from cfx.learners.rollout.window import (
     GradientPath,
     LeaderWindow,
@@ -77,7 +76,7 @@ class Expert:
 
         The experts' state afterwards is returned too.
         """
-        student = LoopState(*(value.detach() for value in student))
+        student = student.detached()
         memory = state.memory
         if memory is None:
             memory = self.step.model.initial_memory(student.speed[..., -1])
@@ -85,6 +84,31 @@ class Expert:
         base, features = state.conditioning.base, state.conditioning.features
         after, speeds, _ = self.step.drive_window(start, leader, leader_length, base, features)
         return speeds, state._replace(memory=after.memory, state=after.state)
+
+
+class CompiledLoop(Protocol):
+    """What compiled code does instead of this module, as `cfx.learners.compiled` makes it."""
+
+    def trajectories(
+        self,
+        dataset: RolloutDataset,
+        batch: RolloutBatch,
+        windows: int,
+        burn_in_windows: int | None,
+    ) -> Segment:
+        """Returns what `simulate` yields without `path`."""
+        ...
+
+    def gradients(
+        self,
+        dataset: RolloutDataset,
+        batch: RolloutBatch,
+        windows: int,
+        path: GradientPath,
+        burn_in_windows: int | None,
+    ) -> Iterator[Segment]:
+        """Yields what `simulate` does with `path`."""
+        ...
 
 
 def burn_in(
@@ -111,8 +135,8 @@ def burn_in(
     if state.is_floating_point() and torch.is_grad_enabled():
         # As all later states, so that one compiled function serves all windows.
         state = state.detach().requires_grad_()
-    for token, own in zip(tokens, present, strict=True):
-        state = step.observe(token, conditioning.features, state, own)
+    for token, has_window in zip(tokens, present, strict=True):
+        state = step.observe(token, conditioning.features, state, has_window)
     return state
 
 
@@ -126,7 +150,7 @@ def simulate(
     burn_in_windows: int | None = None,
     expert: Expert | None = None,
     noise: Tensor | None = None,
-    scan: Scan | None = None,
+    compiled: CompiledLoop | None = None,
 ) -> Iterator[Segment]:
     """Simulates trajectories in closed loop.
 
@@ -141,44 +165,50 @@ def simulate(
         noise: what a stochastic head draws from, `(H, N, paths D, k)`; None: nothing is drawn. Each
             path of all trajectories stands behind the one before. What was measured is observed
             once for all.
-        scan: the window as compiled code, which simulates where no expert is asked and nothing is
-            drawn; None: none.
+        compiled: the window as compiled code, which simulates where no expert is asked and nothing
+            is drawn; None: none.
 
     Yields:
         What was simulated between two cuts of the gradients.
     """
-    if scan is not None and expert is None and noise is None:
-        yield from scan.simulate(dataset, batch, windows, path, burn_in_windows)
+    if compiled is not None and expert is None and noise is None:
+        if path is None:
+            yield compiled.trajectories(dataset, batch, windows, burn_in_windows)
+        else:
+            yield from compiled.gradients(dataset, batch, windows, path, burn_in_windows)
         return
     state = burn_in(step, dataset, batch, dataset.condition(batch), burn_in_windows)
-    paths = 1 if noise is None else noise.shape[2] // batch.place.shape[1]
-    state = state.repeat(1, paths, 1)
-    batch = batch.each(lambda values: values.repeat(1, paths))
+    if noise is not None:
+        paths = noise.shape[2] // batch.place.shape[1]
+        state = state.repeat(1, paths, 1)
+        batch = batch.repeated(paths)
     conditioning = dataset.condition(batch)
     inputs = RolloutInputs.of(dataset.recordings.batch, conditioning.pair, batch, step, windows)
     now = inputs.initial(state)
     expert_state: ExpertState | None = None
     if expert is not None:
         expert_state = expert.begin(batch, burn_in_windows)
-    length = windows if path is None or path.cut_after is None else path.cut_after
+    length = windows
+    if path is not None:
+        length = path.windows_of_segment(windows)
     for first in range(0, windows, length):
-        speeds, gaps, wanted = [], [], []
+        speeds, gaps, expert_speeds = [], [], []
         for window in range(first, min(first + length, windows)):
             leader = inputs.leader_window(window)
             if expert is not None and expert_state is not None:
                 label, expert_state = expert.label(expert_state, now, leader, inputs.leader_length)
-                wanted.append(label)
-            known = (inputs.leader_length, conditioning.base, conditioning.features)
-            if noise is None:
-                now, speed, gap = step.drive_window(now, leader, *known)
-            else:
-                now, speed, gap = step.drive_window(now, leader, *known, noise[window])
+                expert_speeds.append(label)
+            drivers = (inputs.leader_length, conditioning.base, conditioning.features)
+            drawn = None if noise is None else noise[window]
+            now, speed, gap = step.drive_window(now, leader, *drivers, drawn)
             if path is not None:
                 now = path.after_window(now)
             speeds.append(speed)
             gaps.append(gap)
         frames = slice(first * step.stride, (first + len(speeds)) * step.stride)
-        expert_speed = torch.cat(wanted, -1) if wanted else None
+        expert_speed = None
+        if expert_speeds:
+            expert_speed = torch.cat(expert_speeds, -1)
         measured = inputs.measured_at(frames)
         speed, gap = torch.cat(speeds, -1), torch.cat(gaps, -1)
         yield Segment(speed, gap, measured, expert_speed, frames.start)

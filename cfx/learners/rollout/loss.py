@@ -30,8 +30,7 @@ _AT_ONCE = 1_000_000
 
 _LEAST_GAP = 1.0
 """m: added to the gap's error of the base, as the objective's floor is to the objective's:
-otherwise
-trajectories that the base follows well would outweigh all others."""
+otherwise trajectories that the base follows well would outweigh all others."""
 
 _LEAST_DIVISOR = 1e-6
 """Divisor at least, for an objective without a floor."""
@@ -58,28 +57,30 @@ class BaseErrors:
     Attributes:
         over_windows: over the horizon from each window on, `(R, W, 2)`.
         over_pair: over the whole training part, `(R, 2)`; of pooled bases alone.
-        own: the row of each place's driver with their base, `(N, B)`.
-        pooled: with the base of drivers without one of their own.
+        driver_row: of each place's driver with their base, `(N, B)`.
+        pooled_row: with the base of drivers without one of their own.
         objective: the job's.
     """
 
     over_windows: Tensor
     over_pair: Tensor
-    own: Tensor
-    pooled: Tensor
+    driver_row: Tensor
+    pooled_row: Tensor
     objective: Objective
 
     @classmethod
     def of(cls, training_data: TrainingData, dataset: RolloutDataset, horizon: int) -> BaseErrors:
         """Simulates the bases, in the precision of the training data; `horizon` in windows."""
         networks, drivers = dataset.pair.shape
-        own = dataset.base
+        base = dataset.base
         pooled = dataset.pooled[:, None].expand(-1, drivers, -1)
         if training_data.pairs.base is None:
-            pooled = own
-        pair = torch.cat([dataset.pair, dataset.pair], 1)[..., None].to(own.dtype)
-        wanted = torch.cat([pair, torch.cat([own, pooled], 1)], -1)
-        rows, row = torch.unique(wanted.flatten(0, 1), dim=0, return_inverse=True)
+            pooled = base
+        # Rows (pair, base) of all places, with each driver's base and with the pooled one: (N, 2 B,
+        # 1 + n). Those that are equal are simulated once.
+        pair = torch.cat([dataset.pair, dataset.pair], 1)[..., None].to(base.dtype)
+        pairs_and_bases = torch.cat([pair, torch.cat([base, pooled], 1)], -1)
+        rows, row = torch.unique(pairs_and_bases.flatten(0, 1), dim=0, return_inverse=True)
         row = row.view(networks, 2 * drivers)
         pair, unit = rows[:, 0].long(), rows[:, 1:]
         count = torch.bincount(pair, minlength=len(dataset.recordings.batch))
@@ -89,7 +90,7 @@ class BaseErrors:
         # A pair with fewer bases than another has one of them several times.
         bases = unit[first[:, None] + torch.minimum(number, count[:, None] - 1)]
         stride = training_data.windows.stride
-        frames = torch.arange(dataset.recordings.tokens.shape[1], device=own.device) * stride
+        frames = torch.arange(dataset.recordings.tokens.shape[1], device=base.device) * stride
         over_windows = _errors(training_data, dataset, bases, frames, horizon * stride)
         over_pair = _errors(training_data, dataset, bases, frames[:1], int(dataset.last.max()))
         return cls(
@@ -102,26 +103,27 @@ class BaseErrors:
 
     def only(self, networks: slice) -> BaseErrors:
         """Returns the errors of some networks."""
-        used = torch.cat([self.own[networks], self.pooled[networks]], 1)
+        used = torch.cat([self.driver_row[networks], self.pooled_row[networks]], 1)
         rows, row = torch.unique(used, return_inverse=True)
-        drivers = self.own.shape[1]
+        drivers = self.driver_row.shape[1]
         return replace(
             self,
             over_windows=self.over_windows[rows],
             over_pair=self.over_pair[rows],
-            own=row[:, :drivers],
-            pooled=row[:, drivers:],
+            driver_row=row[:, :drivers],
+            pooled_row=row[:, drivers:],
         )
 
     def over_horizon(self, batch: RolloutBatch) -> Divisors:
         """Returns the divisors over the horizon from where each trajectory begins."""
-        own, pooled = self.own[batch.row, batch.place], self.pooled[batch.row, batch.place]
-        row = torch.where(batch.cold_start, pooled, own)
+        driver_row = self.driver_row[batch.row, batch.place]
+        pooled_row = self.pooled_row[batch.row, batch.place]
+        row = torch.where(batch.cold_start, pooled_row, driver_row)
         return self._divisors(self.over_windows[row, batch.start], batch)
 
     def over_full_trajectory(self, batch: RolloutBatch) -> Divisors:
         """Returns the divisors over each trajectory from the first frame to the last."""
-        return self._divisors(self.over_pair[self.pooled[batch.row, batch.place]], batch)
+        return self._divisors(self.over_pair[self.pooled_row[batch.row, batch.place]], batch)
 
     def _divisors(self, errors: Tensor, batch: RolloutBatch) -> Divisors:
         """Takes the errors `(N, D, 2)` of unscaled trajectories."""
@@ -151,35 +153,36 @@ def _errors(
     Returns:
         The objective and the gap's RMSE, `(U, F, C, 2)`, in single precision.
     """
-    simulator, rows = training_data.simulator, dataset.recordings.pair
+    stepper, rows = training_data.stepper, dataset.recordings.pair
     recorded = training_data.pairs.index[rows]
     last = training_data.pairs.split.frame.to(rows.device)[rows]
     # What heads answer beyond the model's parameters stands behind them, and is left out.
-    space = simulator.model.adaptation_space
+    space = stepper.model.adaptation_space
     bases = bases[..., : len(space)]
-    # Whether a kernel pays is asked for all parts together.
-    simulator = simulator.for_work(len(last) * len(frames) * steps * bases.shape[1])
+    # Whether a kernel pays is asked for all shards together.
+    stepper = stepper.for_work(len(last) * len(frames) * steps * bases.shape[1])
     size = max(1, _AT_ONCE // (len(frames) * steps))
-    parts = []
-    for some in range(0, len(last), size):
-        which = slice(some, some + size)
-        count, batch = len(last[which]), training_data.recorded[recorded[which]]
+    errors = []
+    for start in range(0, len(last), size):
+        shard = slice(start, start + size)
+        count, batch = len(last[shard]), training_data.recorded[recorded[shard]]
+        # Each pair from each of the frames on, (count F,).
         pair = torch.arange(count, device=rows.device).repeat_interleave(len(frames))
         first = frames.repeat(count)
         losses = SegmentLosses.of_segments(
-            simulator,
+            stepper,
             training_data.objective,
             batch,
             pair,
             first.clamp(max=batch.mask.shape[1] - 1),
-            (last[which][pair] - first).clamp(0, steps),
+            (last[shard][pair] - first).clamp(0, steps),
         )
-        unit = bases[which].to(losses.segments.counted.dtype)
+        unit = bases[shard].to(losses.segments.counted.dtype)
         values = space.from_unit(unit).repeat_interleave(len(frames), 0)
         p = {name: value.contiguous() for name, value in space.unpack(values).items()}
-        errors = torch.stack([losses(p), replace(losses, objective=GapRmse())(p)], -1)
-        parts.append(errors.view(count, len(frames), -1, 2).float())
-    return torch.cat(parts)
+        of_shard = torch.stack([losses(p), replace(losses, objective=GapRmse())(p)], -1)
+        errors.append(of_shard.view(count, len(frames), -1, 2).float())
+    return torch.cat(errors)
 
 
 _EPSILON = 1e-4

@@ -13,6 +13,7 @@ import os
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -25,10 +26,9 @@ from torch.utils.data import DataLoader
 from cfx.core.engine import Report
 from cfx.learners.batched import BatchedModule, fit
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
-from cfx.learners.rollout.loop import Expert, simulate
+from cfx.learners.rollout.loop import CompiledLoop, Expert, simulate
 from cfx.learners.rollout.loss import Divisors, FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
-from cfx.learners.rollout.scan import Scan
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import TrainedShard, TrainingShard, untrained
 from cfx.learners.rollout.window import GradientPath, WindowStep
@@ -91,15 +91,15 @@ class RolloutModule(BatchedModule):
         network.load_state_dict(shard.weights)
         super().__init__(network, training_data.names, settings, on_epoch, ensemble_size=size)
         self.shard, self.expert = shard, expert
-        windows, dt = training_data.windows, training_data.simulator.dt
-        model = head.driven_model(training_data.simulator.model)
+        windows, dt = training_data.windows, training_data.stepper.dt
+        model = head.driven_model(training_data.stepper.model)
         core = AgentCore(shard.policy, network, dataset.scaler, head)
         self.temperature = torch.tensor(settings.temperature, device=device)
         self.exact_step = WindowStep(core, model, windows, dt)
         if settings.temperature > 0:
             model = model.at_temperature(self.temperature)
         self.training_window = WindowStep(core, model, windows, dt)
-        self.scans: dict[WindowStep, Scan] = {}
+        self.compiled: dict[WindowStep, CompiledLoop] = {}
         if self._is_worth_compiling():
             self._compile()
         self.loss = TrajectoryLoss(training_data.objective, settings, dt)
@@ -200,16 +200,19 @@ class RolloutModule(BatchedModule):
             noise = self._noise(batch, windows, sampled)
             of_centre = torch.zeros_like(noise[:, :, : noise.shape[2] // sampled])
             noise = torch.cat([of_centre, noise], 2)
+        burn_in_windows = None
+        if path is not None:
+            burn_in_windows = self.burn_in_windows
         segments = simulate(
             step,
             self.dataset,
             batch,
             windows,
             path,
-            burn_in_windows=None if path is None else self.burn_in_windows,
+            burn_in_windows=burn_in_windows,
             expert=expert,
             noise=noise,
-            scan=self.scans.get(step),
+            compiled=self.compiled.get(step),
         )
         centre = slice(None, batch.place.shape[1])
         for segment in segments:
@@ -283,8 +286,8 @@ class RolloutModule(BatchedModule):
             greatest = torch.where(too_wide, middle, greatest)
             least = torch.where(too_wide, least, middle)
         self.dispersion.fill_(1.0)
-        known = (batch.weight > 0).any(1)
-        return torch.where(known, (0.5 * (least + greatest)).exp(), 1.0)
+        keeps_drivers = (batch.weight > 0).any(1)
+        return torch.where(keeps_drivers, (0.5 * (least + greatest)).exp(), 1.0)
 
     def _coverage(self, batch: RolloutBatch) -> Tensor:
         """Returns the share of speeds within the range of sampled paths, `(N,)`.
@@ -389,27 +392,40 @@ class RolloutModule(BatchedModule):
 
     def _compile(self) -> None:
         """Compiles the windows of training and of validation."""
-        exact, window = self.exact_step, self.training_window
-        temperature = self.temperature if self.settings.temperature > 0 else None
-        if self.dataset.base.device.type == "cpu":
-            key = window.key()
-            try:
-                scans = {window: Scan(window, temperature, key, trains=True)}
-                scans[exact] = Scan(exact, None, key, trains=False)
-                Scan.compile(list(scans.values()))
-            except Unsupported as reason:
-                log.info("Training has no compiled loop (%s); PyTorch compiles a window", reason)
-            else:
-                self.scans = scans
-                if not self.is_stochastic and not self.settings.distillation_epochs:
-                    return
-        window.compile()
+        s = self.settings
+        if s.compile != "torch" and self.dataset.base.device.type == "cpu":
+            temperature = None
+            if s.temperature > 0:
+                temperature = self.temperature
+            self.compiled = _compiled_loops(self.training_window, temperature, self.exact_step)
+        # Sampled paths and experts go window by window.
+        goes_by_windows = self.is_stochastic or s.distillation_epochs > 0
+        if not self.compiled or goes_by_windows:
+            self.training_window.compile()
 
     def _is_worth_compiling(self) -> bool:
         s = self.settings
         if s.compile == "never" or not can_compile(self.dataset.base.device):
             return False
         return s.compile == "always" or s.epochs * s.steps * s.horizon >= _WORTH_COMPILING
+
+
+def _compiled_loops(
+    training: WindowStep, temperature: Tensor | None, validation: WindowStep
+) -> dict[WindowStep, CompiledLoop]:
+    """Returns whole trajectories as compiled code, by window; none where there can be none."""
+    try:
+        from cfx.learners.compiled import compile_windows
+    except ModuleNotFoundError as missing:
+        if missing.name != "cfx.learners.compiled":
+            raise
+        log.info("cfx.learners.compiled is not there; PyTorch compiles a window of training")
+        return {}
+    try:
+        return dict(compile_windows(training, temperature, validation))
+    except Unsupported as reason:
+        log.info("Training has no compiled loop (%s); PyTorch compiles a window", reason)
+        return {}
 
 
 def train(shard: TrainingShard, report: Report) -> TrainedShard:
@@ -423,27 +439,27 @@ def train(shard: TrainingShard, report: Report) -> TrainedShard:
         report: called with how many epochs are done, in the end all that were planned.
     """
     if shard.checkpoint is not None and not _has_place(shard.checkpoint):
-        expert = shard.expert and replace(shard.expert, checkpoint=None)
-        shard = replace(shard, checkpoint=None, expert=expert)
-    module = _trained(shard, report)
+        expert_shard = shard.expert and replace(shard.expert, checkpoint=None)
+        shard = replace(shard, checkpoint=None, expert=expert_shard)
+    expert = None
+    if shard.expert is not None:
+        expert = _trained_expert(shard.expert, report)
+    module = RolloutModule(shard, expert, partial(report, 1))
+    fit(module, shard.training_data.seed, shard.dataset.pair.device, shard.checkpoint)
+    report(shard.settings.epochs - len(module.rows))
     return TrainedShard(module.network.state_dict(), module.curves(), module.fit_dispersion())
 
 
-def _trained(shard: TrainingShard, report: Report) -> RolloutModule:
-    """Returns trained networks; their experts are trained before."""
-    expert = None
-    if shard.expert is not None:
-        taught = _trained(shard.expert, report)
-        taught.network.requires_grad_(False)
-        if taught.scans:
-            # Experts say one window at a time what they would do.
-            taught.training_window.compile()
-        expert = Expert(taught.training_window, taught.dataset)
-    module = RolloutModule(shard, expert, lambda: report(1))
-    seed, device = shard.training_data.seed, shard.dataset.pair.device
-    fit(module, shard.settings.epochs, seed, device, shard.checkpoint)
+def _trained_expert(shard: TrainingShard, report: Report) -> Expert:
+    """Trains the experts of a shard, on the same trajectories."""
+    module = RolloutModule(shard, None, partial(report, 1))
+    fit(module, shard.training_data.seed, shard.dataset.pair.device, shard.checkpoint)
     report(shard.settings.epochs - len(module.rows))
-    return module
+    module.network.requires_grad_(False)
+    if module.compiled:
+        # Experts say one window at a time what they would do.
+        module.training_window.compile()
+    return Expert(module.training_window, module.dataset)
 
 
 def _has_place(checkpoint: Path) -> bool:

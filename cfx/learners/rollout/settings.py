@@ -12,7 +12,6 @@ from pydantic import AfterValidator, Field, model_validator
 
 from cfx.core.component import Settings
 from cfx.policies.heads import trained_head
-from cfx.simulation.rollout import Compile
 
 
 class OptimisationSettings(Settings):
@@ -186,8 +185,10 @@ class RolloutSettings(LossSettings, TrajectorySettings, OptimisationSettings):
         " acceleration (model=direct), trained before for the remaining number of epochs; for"
         " models with regimes",
     )
-    compile: Compile = Field(
-        "auto", description="the window that training repeats: auto: where it pays; always; never"
+    compile: Literal["auto", "always", "never", "torch"] = Field(
+        "auto",
+        description="the window that training repeats: auto: where it pays, networks with memory by"
+        " cfx's own compiled code; always; never; torch: where it pays, by torch.compile alone",
     )
 
     @model_validator(mode="after")

@@ -53,12 +53,12 @@ def checkpoint_path(
     description = {
         "learner": learner,
         "policy": policy.identity(),
-        "model": training_data.simulator.model.identity(),
+        "model": training_data.stepper.model.identity(),
         "objective": training_data.objective.identity(),
         "windows": training_data.windows.model_dump(),
         "code": folder_hash(base.__file__),
         "data": digest.hexdigest(),
-        "dt": training_data.simulator.dt,
+        "dt": training_data.stepper.dt,
         "names": training_data.names,
         "seed": training_data.seed,
     }
@@ -128,7 +128,7 @@ class TrainingShard:
     @property
     def head(self) -> ParameterHead:
         """Makes parameters of the networks' answers."""
-        model, device = self.training_data.simulator.model, self.dataset.pair.device
+        model, device = self.training_data.stepper.model, self.dataset.pair.device
         return head_class(self.settings.head).for_model(model, device)
 
 
@@ -181,7 +181,7 @@ def shard_checkpoints(checkpoint: Path | None, shards: Sequence[slice]) -> list[
     """Returns the file of each shard, beside that of the whole training; None: no such file."""
     if checkpoint is None or len(shards) == 1:
         return [checkpoint] * len(shards)
-    return [checkpoint.with_suffix(f".{one.start}-{one.stop}.ckpt") for one in shards]
+    return [checkpoint.with_suffix(f".{shard.start}-{shard.stop}.ckpt") for shard in shards]
 
 
 def expert_checkpoint(checkpoint: Path) -> Path:
@@ -242,7 +242,9 @@ def _weights(weights: Mapping[str, Tensor], networks: slice) -> dict[str, Tensor
 
 def _without_pairs(training_data: TrainingData) -> TrainingData:
     """Returns what is said of networks; their pairs are left to the dataset."""
-    pairs = training_data.pairs
+    pairs, base = training_data.pairs, training_data.pairs.base
+    if base is not None:
+        base = base[:0]
     return replace(
         training_data,
         recorded=training_data.recorded[:0],
@@ -251,7 +253,7 @@ def _without_pairs(training_data: TrainingData) -> TrainingData:
             split=pairs.split[:0],
             network=pairs.network[:0],
             fixed=pairs.fixed[:0],
-            base=None if pairs.base is None else pairs.base[:0],
+            base=base,
         ),
         workspace=None,
         engine=LocalEngine(),
@@ -260,18 +262,21 @@ def _without_pairs(training_data: TrainingData) -> TrainingData:
 
 def _expert(shard: TrainingShard, weights: dict[str, Tensor]) -> TrainingShard:
     """Returns the experts of a shard: the same trajectories, driven by `Direct`."""
-    s, simulator = shard.settings, MemoryStepper(Direct(), shard.training_data.simulator.dt)
+    s, stepper = shard.settings, MemoryStepper(Direct(), shard.training_data.stepper.dt)
     epochs = s.epochs - s.distillation_epochs
     changes = {"head": OffsetHead.name, "distillation_epochs": 0, "epochs": epochs}
-    space, fixed = simulator.model.adaptation_space, shard.training_data.pairs.fixed
+    space, fixed = stepper.model.adaptation_space, shard.training_data.pairs.fixed
     default = space.to_unit(space.defaults(dtype=fixed.dtype, device=fixed.device)).float()
+    checkpoint = shard.checkpoint
+    if checkpoint is not None:
+        checkpoint = expert_checkpoint(checkpoint)
     return replace(
         shard,
         settings=s.model_copy(update=changes),
-        training_data=replace(shard.training_data, simulator=simulator),
+        training_data=replace(shard.training_data, stepper=stepper),
         dataset=shard.dataset.for_base(default),
         weights=weights,
-        checkpoint=None if shard.checkpoint is None else expert_checkpoint(shard.checkpoint),
+        checkpoint=checkpoint,
     )
 
 

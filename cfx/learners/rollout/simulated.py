@@ -24,9 +24,16 @@ SITE = "simulated"
 """Where they drive."""
 
 _MODELS = ("krauss", "idm")
+"""Whose drivers they are, by halves."""
+
 _CRUISE_MPS = (2.0, 6.0)
+"""m/s: between which leaders cruise; recordings of free traffic hardly have such speeds."""
+
 _HETEROGENEITY, _VARIATION = 0.5, 0.2
+"""How much drivers differ from one another, and drift in time (`SyntheticSettings`)."""
+
 _LASTS_S = 60.0
+"""s: how long each driver is simulated."""
 
 
 def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingData:
@@ -42,8 +49,8 @@ def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingD
     if count == 0:
         return training_data
     frames = training_data.recorded.mask.shape[1]
-    drivers = simulated_drivers(count, training_data.simulator.dt, frames, training_data.seed)
-    recorded, pairs = training_data.recorded, training_data.pairs
+    drivers = simulated_drivers(count, training_data.stepper.dt, frames, training_data.seed)
+    pairs = training_data.pairs
     batch = PairBatch.of(drivers, device=training_data.device, frames=frames)
     whole = Split.none(drivers, training_data.windows)
     networks, device = len(training_data.names), pairs.index.device
@@ -54,27 +61,31 @@ def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingD
     pooled = pairs.fixed[first.to(pairs.fixed.device)]
     order = torch.cat([pairs.network, network]).argsort(stable=True)
 
-    def joined(ours: Tensor, theirs: Tensor) -> Tensor:
-        return torch.cat([ours, theirs.to(ours)])[order.to(ours.device)]
+    def joined(recorded: Tensor, simulated: Tensor) -> Tensor:
+        return torch.cat([recorded, simulated.to(recorded)])[order.to(recorded.device)]
 
-    def named(ours: tuple[str, ...], theirs: list[str]) -> tuple[str, ...]:
-        names = [*ours, *theirs * networks]
-        return tuple(names[number] for number in order.tolist())
+    def named(recorded: tuple[str, ...], simulated: list[str]) -> tuple[str, ...]:
+        of_all = [*recorded, *simulated * networks]
+        return tuple(of_all[number] for number in order.tolist())
 
     sites = pairs.sites or ("",) * len(pairs)
+    names = [f"{SITE} {pair.pair_id}" for pair in drivers]
+    base = pairs.base
+    if base is not None:
+        base = joined(base, pooled)
     return replace(
         training_data,
-        recorded=recorded.followed_by(batch),
+        recorded=training_data.recorded.followed_by(batch),
         pairs=TrainingPairs(
-            index=joined(pairs.index, len(recorded) + added),
+            index=joined(pairs.index, len(training_data.recorded) + added),
             split=Split(
                 joined(pairs.split.frame, whole.frame.to(added.device)[added]),
                 joined(pairs.split.windows, whole.windows.to(added.device)[added]),
             ),
             network=joined(pairs.network, network),
             fixed=joined(pairs.fixed, pooled),
-            base=None if pairs.base is None else joined(pairs.base, pooled),
-            drivers=named(pairs.known_drivers, [f"{SITE} {pair.pair_id}" for pair in drivers]),
+            base=base,
+            drivers=named(pairs.known_drivers, names),
             sites=named(sites, [SITE] * count),
         ),
     )

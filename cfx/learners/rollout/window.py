@@ -21,18 +21,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.calibration import losses
-from cfx.core import parameters
-from cfx.core.component import folder_hash
 from cfx.data.pairs import PairBatch
 from cfx.data.signals import Signal
 from cfx.learners.rollout.dataset import RolloutBatch
 from cfx.models.base import DrivingModel, Follower, Leader
-from cfx.policies import features, inputs
 from cfx.policies.core import AgentCore
 from cfx.policies.history import History
 from cfx.simulation.kernel.compiler import torch_compiled
-from cfx.simulation.kernel.run import component_code
 from cfx.simulation.step import advance_vehicle
 from cfx.simulation.windows import WindowSettings
 
@@ -55,6 +50,24 @@ class LoopState(NamedTuple):
     memory: Tensor
     state: Tensor
     latent: Tensor
+
+    def detached(self) -> LoopState:
+        """Returns the same values without what gradients would come back from."""
+        return LoopState(*(value.detach() for value in self))
+
+    def as_start(self) -> LoopState:
+        """Returns the same values as the first of a gradient's way, which ends there.
+
+        Where gradients are recorded they flow through the first state too, as through all later
+        ones: otherwise the window step would be compiled once more for it.
+        """
+        states = []
+        for value in self:
+            if value.requires_grad:
+                states.append(value)
+            else:
+                states.append(value.clone().requires_grad_())
+        return LoopState(*states)
 
 
 class LeaderWindow(NamedTuple):
@@ -92,8 +105,8 @@ class WindowStep:
         self.length, self.stride = windows.length, windows.stride
         self.dt = dt
         self.space = core.head.space
-        like = core.scaler.mean
-        low, high = self.space.bounds(dtype=like.dtype, device=like.device)
+        mean = core.scaler.mean
+        low, high = self.space.bounds(dtype=mean.dtype, device=mean.device)
         self.low, self.range = low, high - low
 
     def compile(self) -> None:
@@ -101,22 +114,6 @@ class WindowStep:
         # The compiled functions take the methods' places.
         self.observe = torch_compiled(self.observe, dynamic=False)  # type: ignore[method-assign]
         self.drive_window = torch_compiled(self.drive_window, dynamic=False)  # type: ignore[method-assign]
-
-    def key(self) -> object:
-        """Returns what the window depends on besides tensors; None if only this process knows."""
-        core = self.core
-        code = []
-        parts = (self.model, core.head, core.policy, *core.inputs)
-        for part in parts:
-            code.append(component_code(type(part)))
-        if None in code:
-            return None
-        settings = [self.model.equations_key(), repr(self.space), self.length, self.stride, self.dt]
-        read = [core.policy.inputs, core.summary, core.scaler.mean.shape[-1]]
-        rooms = []
-        for module in (features, inputs, parameters, losses):
-            rooms.append(folder_hash(str(module.__file__)))
-        return [code, settings, read, rooms, folder_hash(__file__)]
 
     def observe(
         self, token: Tensor, conditioning: Tensor, state: Tensor, present: Tensor
@@ -262,9 +259,16 @@ class GradientPath:
     cut_after: int | None = None
     through_motion: bool = True
 
+    def windows_of_segment(self, windows: int) -> int:
+        """Returns how many of a trajectory's windows lie between two cuts."""
+        if self.cut_after is None:
+            return windows
+        return self.cut_after
+
     def after_window(self, state: LoopState) -> LoopState:
         """Returns the state, of the same values, from which the next window starts."""
-        bounded = LoopState(*(_Bounded.apply(value, self.decay, self.clip) for value in state))  # type: ignore[no-untyped-call]
+        values = [_Bounded.apply(value, self.decay, self.clip) for value in state]  # type: ignore[no-untyped-call]
+        bounded = LoopState(*values)
         if self.through_motion:
             return bounded
         return self.after_segment(bounded)._replace(state=bounded.state)
@@ -288,7 +292,7 @@ class _Bounded(torch.autograd.Function):
         return gradient.clamp(-ctx.clip, ctx.clip), None, None
 
 
-class Measured(NamedTuple):
+class MeasuredFrames(NamedTuple):
     """Recorded values at simulated frames, `(N, D, frames)` each.
 
     Attributes:
@@ -316,18 +320,21 @@ class Segment(NamedTuple):
 
     speed: Tensor
     gap: Tensor
-    measured: Measured
+    measured: MeasuredFrames
     expert_speed: Tensor | None
     first: int = 0
 
     def only(self, trajectories: slice) -> Segment:
         """Returns the segment of some trajectories."""
         expert_speed = self.expert_speed
+        if expert_speed is not None:
+            expert_speed = expert_speed[:, trajectories]
+        speed, gap, counted = self.measured
         return Segment(
             self.speed[:, trajectories],
             self.gap[:, trajectories],
-            Measured(*(values[:, trajectories] for values in self.measured)),
-            None if expert_speed is None else expert_speed[:, trajectories],
+            MeasuredFrames(speed[:, trajectories], gap[:, trajectories], counted[:, trajectories]),
+            expert_speed,
             self.first,
         )
 
@@ -355,7 +362,7 @@ class RolloutInputs:
     follower: Tensor
     memory: Tensor
     latent: Tensor
-    measured: Measured
+    measured: MeasuredFrames
 
     @classmethod
     def of(
@@ -377,10 +384,20 @@ class RolloutInputs:
         around = now[..., 0] + frames[:, None, None]
         simulated = now + torch.arange(1, windows * stride + 1, device=device)
         origin = _at(pairs.follower_position, each, now)
-        own = (pairs.follower_position, pairs.follower_speed, pairs.follower_acceleration)
-        ahead = (pairs.leader_position, pairs.leader_speed, pairs.leader_acceleration)
-        follower = torch.stack([_at(signal, each, past) for signal in own])
-        leader = torch.stack([_at(signal, pair, around) for signal in ahead])
+        follower = torch.stack(
+            [
+                _at(pairs.follower_position, each, past),
+                _at(pairs.follower_speed, each, past),
+                _at(pairs.follower_acceleration, each, past),
+            ]
+        )
+        leader = torch.stack(
+            [
+                _at(pairs.leader_position, pair, around),
+                _at(pairs.leader_speed, pair, around),
+                _at(pairs.leader_acceleration, pair, around),
+            ]
+        )
         follower[0] -= origin
         leader[0] -= origin[..., 0]
         speed = _at(pairs.follower_speed, each, simulated)
@@ -409,30 +426,24 @@ class RolloutInputs:
         counted = (simulated <= batch.last[..., None]).to(follower.dtype)
         memory = step.model.initial_memory(follower[1, ..., -1])
         latent = memory.new_zeros((*pair.shape, step.core.head.latent_width))
-        measured = Measured(speed, gap, counted)
+        measured = MeasuredFrames(speed, gap, counted)
         if surroundings:
             leader = torch.cat([leader, torch.stack(surroundings)])
         leader = leader.unfold(1, length + stride, stride)
         return cls(leader, leader_length, follower, memory, latent, measured)
 
     def initial(self, state: Tensor) -> LoopState:
-        """Returns where the trajectories begin; `state` is the policy's, `(N, D, s)`.
-
-        Where gradients are recorded they flow through the first state too, as through all later
-        ones: otherwise the window step would be compiled once more for it.
-        """
+        """Returns where the trajectories begin; `state` is the policy's, `(N, D, s)`."""
         position, speed, acceleration = self.follower.unbind(0)
         begin = LoopState(position, speed, acceleration, self.memory, state, self.latent)
         if not torch.is_grad_enabled():
             return begin
-        return LoopState(
-            *(value if value.requires_grad else value.clone().requires_grad_() for value in begin)
-        )
+        return begin.as_start()
 
-    def measured_at(self, frames: slice) -> Measured:
+    def measured_at(self, frames: slice) -> MeasuredFrames:
         """Returns what was measured at some of the simulated frames."""
         speed, gap, counted = self.measured
-        return Measured(speed[..., frames], gap[..., frames], counted[..., frames])
+        return MeasuredFrames(speed[..., frames], gap[..., frames], counted[..., frames])
 
     def leader_window(self, window: int) -> LeaderWindow:
         """Returns the leader around a window."""

@@ -193,9 +193,9 @@ class MlflowTracker(Tracker):
             self.log_policy(folder / "policy", pairs)
         files = [folder / CONFIG, folder / METRICS, folder / DATA, *result.demo]
         for table in installed():
-            if table.name in result.tables and table.part.tracked:
+            if table.name in result.tables and table.component.tracked:
                 files.append(folder / file_of(table))
-                if table.part.tracked == "table" and not table.part.large:
+                if table.component.tracked == "table" and not table.component.large:
                     self.log_table(result.tables[table.name], f"{table.name}.json")
         self.log_files(files)
 
@@ -209,7 +209,7 @@ class MlflowTracker(Tracker):
 
         profile = {
             "pairs": len(pairs),
-            "drivers": len({pair.driver for pair in pairs}),
+            "drivers": len(set(pairs.drivers)),
             "frames": sum(len(pair) for pair in pairs),
             "time_step_s": pairs.dt,
             "fingerprint": pairs.fingerprint,

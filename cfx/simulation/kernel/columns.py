@@ -22,7 +22,7 @@ VEHICLES = 1009
 Expressions = npt.NDArray[np.object_]
 """A tensor's values as C++ expressions, each for all vehicles."""
 
-Known = Mapping[fx.Node, Any]
+Recorded = Mapping[fx.Node, Any]
 """The expressions of what was recorded before; a sequence of arrays where it gives several."""
 
 
@@ -37,21 +37,26 @@ def memory_names(width: int) -> tuple[str, ...]:
 
 def literal(value: float | bool) -> str:
     """Returns a number as C++ writes it, exactly."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
+    if value is True:
+        return "true"
+    if value is False:
+        return "false"
     number = float(value)
     if math.isnan(number):
         return "real(NAN)"
-    if math.isinf(number):
-        return "real(INFINITY)" if number > 0 else "real(-INFINITY)"
+    if number == math.inf:
+        return "real(INFINITY)"
+    if number == -math.inf:
+        return "real(-INFINITY)"
+    # Hexadecimal: decimal digits would be rounded.
     return f"real({number.hex()})"
 
 
 def array(shape: tuple[int, ...], expressions: Sequence[str]) -> Expressions:
     """Returns expressions in a shape."""
-    found = np.empty(len(expressions), dtype=object)
-    found[:] = expressions
-    return found.reshape(shape)
+    flat = np.empty(len(expressions), dtype=object)
+    flat[:] = expressions
+    return flat.reshape(shape)
 
 
 def shape_of(value: Tensor) -> tuple[int, ...]:
@@ -62,7 +67,10 @@ def shape_of(value: Tensor) -> tuple[int, ...]:
     """
     if list(value.shape).count(VEHICLES) > 1:
         raise Unsupported("an operation that is not elementwise")
-    return tuple(1 if size == VEHICLES else size for size in value.shape)
+    sizes = list(value.shape)
+    if VEHICLES in sizes:
+        sizes[sizes.index(VEHICLES)] = 1
+    return tuple(sizes)
 
 
 def broadcast(expressions: Expressions, shape: tuple[int, ...]) -> Expressions:
@@ -103,43 +111,44 @@ def _columns(node: fx.Node, source: Any) -> int:
     return dimension
 
 
-def _stack(node: fx.Node, known: Known) -> Expressions:
-    parts: Any = node.args[0]
-    return np.stack([known[one] for one in parts], int(_given(node, 1, "dim", 0)))
+def _stack(node: fx.Node, expressions_of: Recorded) -> Expressions:
+    nodes: Any = node.args[0]
+    return np.stack([expressions_of[stacked] for stacked in nodes], int(_given(node, 1, "dim", 0)))
 
 
-def _arange(node: fx.Node, _known: Known) -> Expressions:
+def _arange(node: fx.Node, _expressions_of: Recorded) -> Expressions:
     numbers: Any = node.args
-    if not all(isinstance(one, int) for one in numbers):
-        raise Unsupported("columns that are not counted by whole numbers")
-    found = list(map(literal, range(*numbers)))
-    return array((len(found),), found)
+    for number in numbers:
+        if not isinstance(number, int):
+            raise Unsupported("columns that are not counted by whole numbers")
+    literals = [literal(number) for number in range(*numbers)]
+    return array((len(literals),), literals)
 
 
-def _cat(node: fx.Node, known: Known) -> Expressions:
-    parts: Any = node.args[0]
-    dimension = _columns(node, parts[0])
-    return np.concatenate([known[one] for one in parts], dimension)
+def _cat(node: fx.Node, expressions_of: Recorded) -> Expressions:
+    nodes: Any = node.args[0]
+    dimension = _columns(node, nodes[0])
+    return np.concatenate([expressions_of[joined] for joined in nodes], dimension)
 
 
-def _select(node: fx.Node, known: Known) -> Expressions:
+def _select(node: fx.Node, expressions_of: Recorded) -> Expressions:
     source: Any = node.args[0]
     index = int(_given(node, 2, "index", 0))
-    return np.asarray(np.take(known[source], index, axis=_columns(node, source)))
+    return np.asarray(np.take(expressions_of[source], index, axis=_columns(node, source)))
 
 
-def _slice(node: fx.Node, known: Known) -> Expressions:
+def _slice(node: fx.Node, expressions_of: Recorded) -> Expressions:
     source: Any = node.args[0]
     if node.meta["val"].shape == source.meta["val"].shape:
-        return np.asarray(known[source])
+        return np.asarray(expressions_of[source])
     dimension = _columns(node, source)
     start, end = _given(node, 2, "start", None), _given(node, 3, "end", None)
-    cut: list[slice] = [slice(None)] * known[source].ndim
+    cut: list[slice] = [slice(None)] * expressions_of[source].ndim
     cut[dimension] = slice(start, end, _given(node, 4, "step", 1))
-    return np.asarray(known[source][tuple(cut)])
+    return np.asarray(expressions_of[source][tuple(cut)])
 
 
-def _split(node: fx.Node, known: Known) -> list[Expressions]:
+def _split(node: fx.Node, expressions_of: Recorded) -> list[Expressions]:
     source: Any = node.args[0]
     size = node.args[1]
     if not isinstance(size, int):
@@ -147,26 +156,26 @@ def _split(node: fx.Node, known: Known) -> list[Expressions]:
     dimension = int(_given(node, 2, "dim", 0))
     if source.meta["val"].shape[dimension] == VEHICLES:
         raise Unsupported("an operation that is not elementwise")
-    cuts = range(size, known[source].shape[dimension], size)
-    return np.split(known[source], list(cuts), axis=dimension)
+    cuts = range(size, expressions_of[source].shape[dimension], size)
+    return np.split(expressions_of[source], list(cuts), axis=dimension)
 
 
-def _unbind(node: fx.Node, known: Known) -> list[Expressions]:
+def _unbind(node: fx.Node, expressions_of: Recorded) -> list[Expressions]:
     source: Any = node.args[0]
-    return list(np.moveaxis(known[source], _columns(node, source), 0))
+    return list(np.moveaxis(expressions_of[source], _columns(node, source), 0))
 
 
-def _getitem(node: fx.Node, known: Known) -> Any:
+def _getitem(node: fx.Node, expressions_of: Recorded) -> Any:
     source: Any = node.args[0]
-    return known[source][node.args[1]]
+    return expressions_of[source][node.args[1]]
 
 
-def _reshape(node: fx.Node, known: Known) -> Expressions:
+def _reshape(node: fx.Node, expressions_of: Recorded) -> Expressions:
     """Returns the same values in another shape, in which vehicles have kept their place."""
     source: Any = node.args[0]
     if _before_vehicles(source.meta["val"]) != _before_vehicles(node.meta["val"]):
         raise Unsupported("an operation that is not elementwise")
-    return np.asarray(known[source]).reshape(shape_of(node.meta["val"]))
+    return np.asarray(expressions_of[source]).reshape(shape_of(node.meta["val"]))
 
 
 def _before_vehicles(value: Tensor) -> int | None:
@@ -177,7 +186,7 @@ def _before_vehicles(value: Tensor) -> int | None:
     return math.prod(shape[: shape.index(VEHICLES)])
 
 
-def _gather(node: fx.Node, known: Known) -> Expressions:
+def _gather(node: fx.Node, expressions_of: Recorded) -> Expressions:
     """Returns columns of the model's memory whose numbers are computed.
 
     A number outside of the memory gives its first or last column; PyTorch would raise an error.
@@ -188,7 +197,7 @@ def _gather(node: fx.Node, known: Known) -> Expressions:
     source: Any = node.args[0]
     index: Any = node.args[2]
     dimension = _columns(node, source)
-    values = known[source]
+    values = expressions_of[source]
     if dimension % values.ndim != values.ndim - 1:
         raise Unsupported("a look-up along another dimension than the last")
     names = list(map(str, values.flat))
@@ -198,11 +207,11 @@ def _gather(node: fx.Node, known: Known) -> Expressions:
     last = len(names) - 1
     if names != list(memory_names(first + last + 1)[first:]):
         raise Unsupported("a look-up in columns that are not neighbours")
-    found = [f"(RECALLED({first}, {last}, {one}))" for one in known[index].flat]
-    return array(known[index].shape, found)
+    columns = [f"(RECALLED({first}, {last}, {number}))" for number in expressions_of[index].flat]
+    return array(expressions_of[index].shape, columns)
 
 
-MOVES: dict[str, Callable[[fx.Node, Known], Any]] = {
+MOVES: dict[str, Callable[[fx.Node, Recorded], Any]] = {
     "arange": _arange,
     "cat": _cat,
     "gather": _gather,

@@ -53,9 +53,9 @@ _TIMEOUT_S = 120
 def find_compiler() -> str | None:
     """Returns the C++ compiler of this machine; None where there is none."""
     for name in ("g++", "c++", "clang++"):
-        found = shutil.which(name)
-        if found is not None:
-            return found
+        path = shutil.which(name)
+        if path is not None:
+            return path
     return None
 
 
@@ -128,8 +128,9 @@ def _key(source: str, compiler: str, flags: tuple[str, ...]) -> str:
     """Returns what the library depends on, as a hash: source, compiler and processor."""
     real = Path(compiler).resolve()
     version = f"{real}:{real.stat().st_mtime_ns}"
-    parts = (source, " ".join((*flags, *_VECTOR_MATH)), version, platform.machine(), processor())
-    return hashlib.sha256("\0".join(parts).encode()).hexdigest()
+    options = " ".join((*flags, *_VECTOR_MATH))
+    described = (source, options, version, platform.machine(), processor())
+    return hashlib.sha256("\0".join(described).encode()).hexdigest()
 
 
 @functools.cache
@@ -148,9 +149,11 @@ def processor() -> str:
 @functools.cache
 def cache_folder() -> Path:
     """Returns a folder that this user alone can write to."""
-    given = os.environ.get("CFX_KERNEL_CACHE")
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
-    folder = Path(given) if given else Path(base) / "cfx" / "kernels"
+    folder = Path(base) / "cfx" / "kernels"
+    given = os.environ.get("CFX_KERNEL_CACHE")
+    if given:
+        folder = Path(given)
     folder = folder.expanduser()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)

@@ -53,10 +53,10 @@ def parameter_names(count: int) -> tuple[str, ...]:
     return tuple(f"p{k}" for k in range(count))
 
 
-class Statement(NamedTuple):
+class Assignment(NamedTuple):
     """One operation: `name = expression`, a number or (`is_condition`) true or false.
 
-    `cfx.simulation.kernel.elementwise` differentiates `operation` by its `operands`.
+    `cfx.learners.compiled` differentiates `operation` by its `operands`.
     """
 
     name: str
@@ -64,6 +64,13 @@ class Statement(NamedTuple):
     is_condition: bool
     operation: str = ""
     operands: tuple[str, ...] = ()
+
+    @property
+    def declaration(self) -> str:
+        """The statement in C++."""
+        if self.is_condition:
+            return f"const bool {self.name} = {self.expression};"
+        return f"const real {self.name} = {self.expression};"
 
 
 class StepProgram(NamedTuple):
@@ -76,7 +83,7 @@ class StepProgram(NamedTuple):
         terms: expressions of what the frame adds to each sum.
     """
 
-    statements: tuple[Statement, ...]
+    statements: tuple[Assignment, ...]
     state: tuple[str, str, str]
     memory: tuple[str, ...]
     terms: tuple[str, ...]
@@ -104,27 +111,27 @@ def record(
     last = len(INPUTS) + len(parameters)
 
     def step(*values: Tensor) -> tuple[Tensor, ...]:
-        known = dict(zip(INPUTS, values, strict=False))
+        inputs = dict(zip(INPUTS, values, strict=False))
         p = dict(zip(parameters, values[len(INPUTS) : last], strict=True))
         memory = torch.empty((VEHICLES, 0), dtype=dtype)
         if width:
             memory = torch.stack(values[last:], dim=-1)
-        follower = Follower(known["position"], known["speed"], known["acceleration"], memory)
+        follower = Follower(inputs["position"], inputs["speed"], inputs["acceleration"], memory)
         leader = Leader(
-            known["leader_position"],
-            known["leader_speed"],
-            known["leader_acceleration"],
-            known["leader_length"],
+            inputs["leader_position"],
+            inputs["leader_speed"],
+            inputs["leader_acceleration"],
+            inputs["leader_length"],
         )
         after = advance_vehicle(model, follower, leader, p, dt)
-        gap = known["leader_rear"] - after.position
-        measured = known["measured_speed"], known["measured_gap"]
+        gap = inputs["leader_rear"] - after.position
+        measured = inputs["measured_speed"], inputs["measured_gap"]
         added = terms.function(after.speed, gap, *measured)
         return (after.position, after.speed, after.acceleration, after.memory, *added)
 
-    graph = _traced(step, last + width, dtype)
+    graph = traced(step, last + width, dtype)
     names = [*INPUTS, *parameter_names(len(parameters)), *memory_names(width)]
-    statements, (position, speed, acceleration, memory, *added) = _Recording(names).function(graph)
+    statements, (position, speed, acceleration, memory, *added) = Recording(names).function(graph)
     if len(memory) != width:
         raise Unsupported("a memory that changes its width")
     state = (position[0], speed[0], acceleration[0])
@@ -140,96 +147,55 @@ def record_terms(terms: Terms, dtype: torch.dtype) -> None:
         Unsupported: as `record`.
     """
     names = INPUTS[:4]
-    _Recording(names).function(_traced(terms.function, len(names), dtype))
+    Recording(names).function(traced(terms.function, len(names), dtype))
 
 
-def _traced(
-    function: Callable[..., Sequence[Tensor]], inputs: int, dtype: torch.dtype, simpler: Any = None
+def traced(
+    function: Callable[..., Sequence[Tensor]],
+    inputs: int,
+    dtype: torch.dtype,
+    decompositions: Any = None,
 ) -> fx.Graph:
     """Returns the operations of a function of so many tensors `(V,)`."""
+    # Imported here: it takes seconds, and a process that finds its kernels on the disk needs none.
     from torch.fx.experimental.proxy_tensor import make_fx
 
-    examples = [torch.full((VEHICLES,), 1.0 + number, dtype=dtype) for number in range(inputs)]
+    examples = []
+    for number in range(inputs):
+        # Different values, all above 0: none is special to an equation.
+        examples.append(torch.full((VEHICLES,), 1.0 + number, dtype=dtype))
     try:
-        graph: fx.Graph = make_fx(function, simpler)(*examples).graph
+        graph: fx.Graph = make_fx(function, decompositions)(*examples).graph
     except Exception as error:
         raise Unsupported(f"recording it failed ({type(error).__name__})") from error
     return graph
 
 
-class Program(NamedTuple):
-    """An elementwise function, as C++ expressions over the columns of its inputs.
-
-    Attributes:
-        inputs: names of the columns of each input.
-        statements: in order.
-        outputs: expressions of the columns of each output.
-    """
-
-    inputs: tuple[tuple[str, ...], ...]
-    statements: tuple[Statement, ...]
-    outputs: tuple[tuple[str, ...], ...]
-
-
-def record_function(
-    function: Callable[..., Sequence[Tensor]], widths: Sequence[int], dtype: torch.dtype
-) -> Program:
-    """Records an elementwise function of tensors `(V, width)`.
-
-    Args:
-        function: pure; returns such tensors.
-        widths: of its arguments, at least 1 each.
-        dtype: of all values.
-
-    Raises:
-        Unsupported: as `record`.
-    """
-    from torch._decomp import get_decompositions
-
-    names: list[tuple[str, ...]] = []
-    for number, width in enumerate(widths):
-        names.append(tuple(f"in{number}_{column}" for column in range(width)))
-
-    def of_columns(*values: Tensor) -> Sequence[Tensor]:
-        arguments, first = [], 0
-        for width in widths:
-            arguments.append(torch.stack(values[first : first + width], -1))
-            first += width
-        return function(*arguments)
-
-    flat = list(itertools.chain(*names))
-    wanted = (torch.ops.aten.logit, torch.ops.aten.lerp, torch.ops.aten.std)
-    simpler: Any = get_decompositions(wanted)
-    graph = _traced(of_columns, len(flat), dtype, simpler)
-    if any(operation_of(node) == "detach" for node in graph.nodes):
-        raise Unsupported("a gradient that is cut")
-    statements, outputs = _Recording(flat).function(graph)
-    return Program(tuple(names), statements, outputs)
-
-
-class _Recording:
+class Recording:
     """Turns a recorded graph into statements."""
 
     def __init__(self, inputs: Sequence[str]) -> None:
         self._inputs = iter(inputs)
-        self._statements: list[Statement] = []
-        self._known: dict[fx.Node, Any] = {}
+        self._statements: list[Assignment] = []
+        self._expressions_of: dict[fx.Node, Any] = {}
 
     def function(
         self, graph: fx.Graph
-    ) -> tuple[tuple[Statement, ...], tuple[tuple[str, ...], ...]]:
+    ) -> tuple[tuple[Assignment, ...], tuple[tuple[str, ...], ...]]:
         """Returns the statements, and the expressions of the columns of each result."""
         for node in graph.nodes:
             if node.op == "placeholder":
-                self._known[node] = array((1,), [next(self._inputs)])
+                self._expressions_of[node] = array((1,), [next(self._inputs)])
             elif node.op == "call_function":
-                self._known[node] = self._computed(node)
+                self._expressions_of[node] = self._computed(node)
             elif node.op == "get_attr":
-                self._known[node] = _constant(graph, node)
+                self._expressions_of[node] = _constant(graph, node)
             elif node.op == "output":
                 returned: Any = node.args[0]
-                found = [tuple(map(str, self._known[value].flat)) for value in returned]
-                return tuple(self._statements), tuple(found)
+                results = []
+                for value in returned:
+                    results.append(tuple(map(str, self._expressions_of[value].flat)))
+                return tuple(self._statements), tuple(results)
         raise Unsupported("it returns nothing")
 
     def _computed(self, node: fx.Node) -> Any:
@@ -237,10 +203,10 @@ class _Recording:
         value = node.meta.get("val")
         move = MOVES.get(operation_of(node))
         if move is not None:
-            found = move(node, self._known)
+            moved = move(node, self._expressions_of)
             if isinstance(value, Tensor):
-                return self._named(found.reshape(shape_of(value)), value)
-            return found
+                return self._named(moved.reshape(shape_of(value)), value)
+            return moved
         if not isinstance(value, Tensor):
             raise Unsupported(f"the operation {operation_of(node)}")
         return self._named(self._elementwise(node, shape_of(value)), value)
@@ -248,11 +214,11 @@ class _Recording:
     def _elementwise(self, node: fx.Node, shape: tuple[int, ...]) -> Expressions:
         """Returns what an operation computes of each element of its operands."""
         operands: list[Expressions] = []
-        for one in node.args:
-            if isinstance(one, fx.Node):
-                operands.append(broadcast(self._known[one], shape))
+        for argument in node.args:
+            if isinstance(argument, fx.Node):
+                operands.append(broadcast(self._expressions_of[argument], shape))
             else:
-                operands.append(broadcast(array((), [_number(one)]), shape))
+                operands.append(broadcast(array((), [_number(argument)]), shape))
         computed = []
         is_condition = node.meta["val"].dtype == torch.bool
         for place in itertools.product(*map(range, shape)):
@@ -275,7 +241,7 @@ class _Recording:
         if not expression.startswith("("):
             return expression
         name = f"s{len(self._statements)}"
-        statement = Statement(name, expression, is_condition, operation, tuple(operands))
+        statement = Assignment(name, expression, is_condition, operation, tuple(operands))
         self._statements.append(statement)
         return name
 
@@ -286,7 +252,8 @@ def _constant(graph: fx.Graph, node: fx.Node) -> Expressions:
         value = getattr(value, name)
     if not isinstance(value, Tensor) or VEHICLES in value.shape or value.numel() > _MOST_COLUMNS:
         raise Unsupported("a constant that is no number")
-    return array(tuple(value.shape), [literal(one) for one in value.flatten().tolist()])
+    literals = [literal(number) for number in value.flatten().tolist()]
+    return array(tuple(value.shape), literals)
 
 
 _TEMPLATES: dict[str, str] = {
@@ -394,7 +361,9 @@ def _passed_on(operation: str, arguments: list[str]) -> str:
         return arguments[1]
     if operation in _FILLED:
         return literal(_FILLED[operation])
-    return arguments[0] if operation in _UNCHANGED else ""
+    if operation in _UNCHANGED:
+        return arguments[0]
+    return ""
 
 
 def _number(value: Any) -> str:
@@ -422,8 +391,9 @@ def _converted(node: fx.Node, given: str) -> str:
 
 def _clamped(node: fx.Node, arguments: list[str]) -> str:
     low, high = [*arguments[1:], "", ""][:2]
-    if any(isinstance(bound, fx.Node) for bound in node.kwargs.values()):
-        raise Unsupported("bounds that are computed and given by name")
+    for bound in node.kwargs.values():
+        if isinstance(bound, fx.Node):
+            raise Unsupported("bounds that are computed and given by name")
     if "min" in node.kwargs:
         low = _number(node.kwargs["min"])
     if "max" in node.kwargs:

@@ -28,11 +28,11 @@ from cfx.simulation.trajectory import ComponentKey, Segments, Terms, common_shap
 
 log = logging.getLogger(__name__)
 
-_UNITS_AT_ONCE = 64
-"""Units of work that a thread takes at a time."""
+_SHARDS_AT_ONCE = 64
+"""Shards (a problem with a block of its candidates) that a thread takes at a time."""
 
 
-class _View(ctypes.Structure):
+class _TensorView(ctypes.Structure):
     """A tensor as the kernel sees it: where it lies, and its strides over problems and the rest."""
 
     _fields_ = (("data", ctypes.c_void_p), ("problem", ctypes.c_long), ("other", ctypes.c_long))
@@ -85,18 +85,18 @@ def component_code(component: type) -> list[str] | None:
     """
     if getattr(component, "process_code", ""):
         return None
-    found = []
-    for part in component.__mro__:
-        if part.__module__ in {"abc", "builtins", "typing"}:
+    names_and_code = []
+    for ancestor in component.__mro__:
+        if ancestor.__module__ in {"abc", "builtins", "typing"}:
             continue
-        if "<locals>" in part.__qualname__:
+        if "<locals>" in ancestor.__qualname__:
             return None
         try:
-            code = folder_hash(inspect.getfile(part))
+            code = folder_hash(inspect.getfile(ancestor))
         except (OSError, TypeError):
             return None
-        found.append(f"{part.__module__}.{part.__qualname__} {code}")
-    return found
+        names_and_code.append(f"{ancestor.__module__}.{ancestor.__qualname__} {code}")
+    return names_and_code
 
 
 _KERNELS: dict[KernelKey, _Kernel | None] = {}
@@ -136,7 +136,10 @@ def accumulate(
     if kernel is None:
         return None
     keep_freed_memory()
-    shape = common_shape([(len(segments.speed), 1), *[value.shape for value in p.values()]])
+    shapes: list[tuple[int, ...]] = [(len(segments.speed), 1)]
+    for value in p.values():
+        shapes.append(value.shape)
+    shape = common_shape(shapes)
     memory = model.initial_memory(segments.speed).contiguous()
     if every is None:
         sums = segments.speed.new_empty((kernel.terms, *shape))
@@ -169,27 +172,35 @@ def _kernel(
     summed: bool = True,
 ) -> _Kernel | None:
     """Returns the kernel for a model and an objective, made at the first call."""
-    parameters = tuple((name, value.dim() > 0) for name, value in p.items())
-    whole_key = KernelKey(
+    varied = []
+    for name, value in p.items():
+        varied.append((name, value.dim() > 0))
+    key = KernelKey(
         model=model_key(model),
         temperature=float(model.temperature),
         terms=terms.key,
         dt=dt,
-        parameters=parameters,
+        parameters=tuple(varied),
         dtype=next(iter(p.values())).dtype,
         summed=summed,
     )
     with _MAKING:
-        if whole_key not in _KERNELS:
-            _KERNELS[whole_key] = _made(model, terms, whole_key)
-        return _KERNELS[whole_key]
+        if key not in _KERNELS:
+            _KERNELS[key] = _made(model, terms, key)
+        return _KERNELS[key]
 
 
 def _made(model: DrivingModel, terms: Terms, key: KernelKey) -> _Kernel | None:
     if compiler.find_compiler() is None:
         return None
-    source = compiler.remembered(key.lasting(), lambda: _source(model, terms, key))
-    library = compiler.build_library(source) if source else None
+
+    def source_of_kernel() -> str:
+        return _source(model, terms, key)
+
+    source = compiler.remembered(key.lasting(), source_of_kernel)
+    if not source:
+        return None
+    library = compiler.build_library(source)
     if library is None:
         return None
     return _Kernel(library.accumulate, int(library.terms()))
@@ -197,14 +208,16 @@ def _made(model: DrivingModel, terms: Terms, key: KernelKey) -> _Kernel | None:
 
 def _source(model: DrivingModel, terms: Terms, key: KernelKey) -> str:
     """Returns the C++ source of a kernel; nothing where there can be none."""
-    names = tuple(name for name, _ in key.parameters)
+    names, varied = [], []
+    for name, varies in key.parameters:
+        names.append(name)
+        varied.append(varies)
     try:
         program = record(model, names, key.dt, terms, key.dtype)
     except Unsupported as reason:
         name = _without_kernel(model, terms, key.dtype)
         log.info("%s has no compiled kernel (%s); PyTorch simulates it", name, reason)
         return ""
-    varied = [varied for _, varied in key.parameters]
     return write(program, varied, key.dtype, summed=key.summed)
 
 
@@ -231,12 +244,12 @@ def _run(
     signals = []
     for name in SIGNALS:
         signals.append(_signal(getattr(segments, name)))
-    views = (_View * len(signals))(*signals)
+    views = (_TensorView * len(signals))(*signals)
     values = [_parameter(value, problems, candidates) for value in parameters]
-    parameter_views = (_View * len(values))(*values)
+    parameter_views = (_TensorView * len(values))(*values)
     counted = _signal(segments.counted)
-    remembered = _View(memory.data_ptr(), memory.stride(0), memory.stride(1))
-    units = problems * -(-candidates // BLOCK)
+    remembered = _TensorView(memory.data_ptr(), memory.stride(0), memory.stride(1))
+    shards = problems * -(-candidates // BLOCK)
 
     def take(first: int) -> None:
         kernel.function(
@@ -250,11 +263,11 @@ def _run(
             ctypes.c_long(candidates),
             *rows,
             ctypes.c_long(first),
-            ctypes.c_long(min(first + _UNITS_AT_ONCE, units)),
+            ctypes.c_long(min(first + _SHARDS_AT_ONCE, shards)),
         )
 
     # A call of the kernel holds no lock of Python's.
-    share(take, range(0, units, _UNITS_AT_ONCE), level="kernel")
+    share(take, range(0, shards, _SHARDS_AT_ONCE), level="kernel")
 
 
 def _ends(counted: Tensor) -> Tensor:
@@ -263,15 +276,16 @@ def _ends(counted: Tensor) -> Tensor:
     return torch.where(counted > 0, number, 0).amax(0).contiguous()
 
 
-def _signal(value: Tensor) -> _View:
+def _signal(value: Tensor) -> _TensorView:
     """Returns a view of a signal `(K, P)`, or of values `(P,)`."""
     if value.dim() == 1:
-        return _View(value.data_ptr(), value.stride(0), 0)
-    return _View(value.data_ptr(), value.stride(1), value.stride(0))
+        return _TensorView(value.data_ptr(), value.stride(0), 0)
+    return _TensorView(value.data_ptr(), value.stride(1), value.stride(0))
 
 
-def _parameter(value: Tensor, problems: int, candidates: int) -> _View:
+def _parameter(value: Tensor, problems: int, candidates: int) -> _TensorView:
     if value.dim() == 0:
-        return _View(value.data_ptr(), 0, 0)
-    whole = value.expand(problems, candidates)
-    return _View(whole.data_ptr(), whole.stride(0), whole.stride(1))
+        return _TensorView(value.data_ptr(), 0, 0)
+    # An expanded view: where problems or candidates share a value, its stride is 0.
+    of_all = value.expand(problems, candidates)
+    return _TensorView(of_all.data_ptr(), of_all.stride(0), of_all.stride(1))

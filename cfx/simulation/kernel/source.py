@@ -1,7 +1,7 @@
-"""A recorded step as a C++ loop: units of work, then time, then candidates in vector registers.
+"""A recorded step as a C++ loop: shards of work, then time, then candidates in vector registers.
 
-A unit is one problem with a block of its candidates. All their states stay in the first-level cache
-while the leader's frames pass by, and the compiler turns the loop over candidates into vector
+A shard is one problem with a block of its candidates. All their states stay in the first-level
+cache while the leader's frames pass by, and the compiler turns the loop over candidates into vector
 instructions: nothing in it depends on another candidate.
 """
 
@@ -16,7 +16,7 @@ from cfx.simulation.kernel.columns import memory_names
 from cfx.simulation.kernel.graph import INPUTS, StepProgram, parameter_names
 
 BLOCK = 32
-"""Candidates of a unit."""
+"""Candidates of a shard."""
 
 _TYPES = {torch.float64: "double", torch.float32: "float"}
 
@@ -75,8 +75,8 @@ extern "C" void accumulate(
     const View* memory, real* sums, long problems, long candidates, long rows, long every,
     long first, long last) {
   const long blocks = (candidates + BLOCK - 1) / BLOCK;
-  for (long unit = first; unit < last; ++unit) {
-    const long i = unit / blocks, begin = (unit % blocks) * BLOCK;
+  for (long shard = first; shard < last; ++shard) {
+    const long i = shard / blocks, begin = (shard % blocks) * BLOCK;
     const long width = std::min(BLOCK, candidates - begin);
     real X[BLOCK], V[BLOCK], A[BLOCK];
 """
@@ -133,21 +133,24 @@ def _shift(memory: Sequence[str]) -> int:
     the memory's beginning instead writes one frame, not all.
     """
     names = memory_names(len(memory))
-    most, best = 0, 0
+    most_moved, best = 0, 0
     for shift in range(len(memory)):
+        # How many columns after the step are those of `shift` columns before.
         moved = sum(map(operator.eq, memory[shift:], names))
-        if moved > most:
-            most, best = moved, shift
+        if moved > most_moved:
+            most_moved, best = moved, shift
     return best
 
 
 def _room(width: int, shift: int) -> int:
     """Returns how many columns before a memory are free, before it must be copied to the end."""
-    return width // shift * shift if shift else 0
+    if shift == 0:
+        return 0
+    return width // shift * shift
 
 
 def _begin(varied: Sequence[bool], terms: int, width: int, shift: int) -> list[str]:
-    """Returns the declarations and first values of a unit's states, sums and parameters."""
+    """Returns the declarations and first values of a shard's states, sums and parameters."""
     lines = []
     if width:
         room = _room(width, shift)
@@ -198,8 +201,7 @@ def _loop(program: StepProgram, varied: Sequence[bool], shift: int, *, summed: b
     for k, name in enumerate(names):
         lines.append(f"        const real {name} = M[{k}][j];")
     for statement in program.statements:
-        kind = "bool" if statement.is_condition else "real"
-        lines.append(f"        const {kind} {statement.name} = {statement.expression};")
+        lines.append(f"        {statement.declaration}")
     for k, term in enumerate(program.terms):
         lines.append(f"        const real added{k} = {term};")
     for array, value in zip(("next_x", "next_v", "next_a"), program.state, strict=True):
@@ -220,7 +222,9 @@ def _loop(program: StepProgram, varied: Sequence[bool], shift: int, *, summed: b
 
 def _added(terms: int, *, summed: bool) -> list[str]:
     """Returns what adds the terms of a frame to their sums, or keeps them alone."""
-    sign = "+=" if summed else "="
+    sign = "="
+    if summed:
+        sign = "+="
     return [f"        S{k}[j] {sign} added{k} * weight;" for k in range(terms)]
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from cfx.calibration.calibrator import Labels
+from cfx.calibration.calibrator import WindowLabels
 from cfx.core.contract import expect_close, once
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.signals import RECORDED
@@ -59,11 +59,11 @@ def training_data(
     pairs = _recording()
     split = Split.of(pairs, WINDOWS, 0.8)
     truth = _truth(pairs, model)
-    network, names = torch.arange(PAIRS), tuple(pair.pair_id for pair in pairs)
+    network, names = torch.arange(PAIRS), tuple(pairs.ids)
     if together:
         network, names = torch.zeros_like(network), ("all",)
     return TrainingData(
-        simulator=MemoryStepper(model, pairs.dt),
+        stepper=MemoryStepper(model, pairs.dt),
         recorded=PairBatch.of(pairs),
         pairs=TrainingPairs(
             index=torch.arange(PAIRS),
@@ -84,11 +84,11 @@ def _truth(pairs: PairSet, model: Krauss) -> Tensor:
     return torch.tensor(rows, dtype=torch.float64)
 
 
-def _labels(split: Split, truth: Tensor) -> Labels:
+def _labels(split: Split, truth: Tensor) -> WindowLabels:
     """Returns the drivers' parameters as labels of all windows."""
     windows = Windows.of(split.windows, WINDOWS)
     count = len(windows)
-    return Labels(
+    return WindowLabels(
         windows=windows,
         parameters=truth[windows.pair],
         loss=torch.zeros(count, dtype=torch.float64),
@@ -212,7 +212,7 @@ def networks_are_independent(learner: Learner) -> None:
     labels = data.pairs.labels
     if labels is not None:
         of_first = (labels.windows.pair == 0)[:, None]
-        default = data.simulator.model.space.defaults()
+        default = data.stepper.model.space.defaults()
         parameters = torch.where(of_first, default, labels.parameters)
         labels = replace(labels, parameters=parameters)
         other = replace(other, pairs=replace(other.pairs, labels=labels))
@@ -288,7 +288,7 @@ def _rmse(result: TrainingResult, data: TrainingData) -> float:
     """Returns the RMSE of speed in closed loop over the training parts, m/s."""
     first = torch.zeros(PAIRS, dtype=torch.int64)
     followers = Followers(data.batch, data.pairs.network)
-    loop = simulate_closed_loop(data.simulator, _agent(result, data), followers, first)
+    loop = simulate_closed_loop(data.stepper, _agent(result, data), followers, first)
     frames = torch.arange(loop.speed.shape[1])
     counted = (frames > 0) & (frames <= data.pairs.split.frame[:, None])
     error = (loop.speed - data.batch.follower_speed[:, : loop.speed.shape[1]])[counted]
@@ -297,7 +297,7 @@ def _rmse(result: TrainingResult, data: TrainingData) -> float:
 
 def _head(result: TrainingResult, data: TrainingData) -> ParameterHead:
     name = result.head or head_name(has_base=result.base is not None)
-    return head_class(name).for_model(data.simulator.model)
+    return head_class(name).for_model(data.stepper.model)
 
 
 def _agent(result: TrainingResult, data: TrainingData) -> Agent:
@@ -306,7 +306,7 @@ def _agent(result: TrainingResult, data: TrainingData) -> Agent:
         model_node={},
         policy_node={},
         windows=WINDOWS,
-        dt=data.simulator.dt,
+        dt=data.stepper.dt,
         names=data.names,
         base=result.base,
     )

@@ -122,7 +122,7 @@ def a_batch_equals_the_loop_over_it(model: DrivingModel) -> None:
             alone,
             together[k],
             msg=f"follower {k} moves differently alone than in a batch: results would depend on"
-            " chunks",
+            " shards",
         )
 
 

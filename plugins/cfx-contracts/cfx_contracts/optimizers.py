@@ -232,7 +232,7 @@ def another_seed_searches_elsewhere(optimizer: Optimizer) -> None:
 def problems_are_independent(optimizer: Optimizer) -> None:
     optima, guesses = _random(10, 3, seed=5), _random(10, 2, 3, seed=6)
     message = (
-        "a problem's result must not depend on the problems beside it: caches and chunks would"
+        "a problem's result must not depend on the problems beside it: caches and shards would"
         " change results"
     )
     for function in (distance, bowl, some_nan):
@@ -242,7 +242,7 @@ def problems_are_independent(optimizer: Optimizer) -> None:
         expect_close(alone.best, together.best[3:7], rtol=1e-3, atol=1e-4, msg=message)
 
 
-def chunks_change_nothing(optimizer: Optimizer) -> None:
+def shards_change_nothing(optimizer: Optimizer) -> None:
     problems, guesses = Problems(distance, _random(3, 2, seed=5)), _random(3, 1, 2, seed=6)
     whole = optimizer.minimize(problems, guesses, seed=1)
     pieces = optimizer.minimize(problems, guesses, seed=1, memory=1)
@@ -353,7 +353,7 @@ CONTRACT = contract_of(
     slow=[
         problems_are_independent,
         survives_whatever_the_losses_are,
-        chunks_change_nothing,
+        shards_change_nothing,
         another_seed_searches_elsewhere,
         recovers_a_known_optimum,
         never_leaves_the_bounds,

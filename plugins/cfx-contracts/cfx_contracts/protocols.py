@@ -54,7 +54,7 @@ def context(
     """Returns a context of some trajectories; a small recurrent network is its policy."""
     model = Krauss()
     batch = PairBatch.of(pairs)
-    simulator = MemoryStepper(model, pairs.dt)
+    stepper = MemoryStepper(model, pairs.dt)
     return ProtocolContext(
         pairs=pairs,
         batch=batch,
@@ -62,7 +62,7 @@ def context(
         model_node={"name": "krauss"},
         policy_node={"name": "gru"},
         calibrator=Calibrator(
-            Solver(simulator, RandomSearch(samples=512), seed=seed, memory=1 << 28),
+            Solver(stepper, RandomSearch(samples=512), seed=seed, memory=1 << 28),
             cache=Cache(None),
         ),
         policy=policy or GruPolicy(hidden_size=4),

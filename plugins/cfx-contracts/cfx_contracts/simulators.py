@@ -116,7 +116,7 @@ def followers_are_independent(simulator: Simulator, model: Model = None) -> None
             alone,
             together[:, first:last],
             "a follower must drive the same alone as beside others: a batch is no traffic, and"
-            " results would depend on chunks",
+            " results would depend on shards",
         )
 
 

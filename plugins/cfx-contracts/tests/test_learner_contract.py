@@ -38,7 +38,7 @@ class Plain(Learner):
             tokens(history, policy_inputs(policy.inputs), policy.summary).float(),
             len(training_data.batch),
         )
-        space = training_data.simulator.model.space
+        space = training_data.stepper.model.space
         wanted, _ = windows.to_grid(
             space.to_unit(training_data.pairs.labels.parameters).float(), len(training_data.batch)
         )

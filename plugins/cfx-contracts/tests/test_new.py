@@ -203,7 +203,7 @@ def test_a_kind_of_another_distribution_has_no_template(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys
 ) -> None:
     another = registry.Kind("poster", "cfx.core.component:Component", chosen=False)
-    monkeypatch.setitem(registry.PARTS, "poster", another)
+    monkeypatch.setitem(registry.SIMPLE_KINDS, "poster", another)
     monkeypatch.chdir(tmp_path)
     assert cli.main(["plugins", "new", "poster", "mine"]) == 2
     (said,) = capsys.readouterr().err.splitlines()

@@ -11,7 +11,7 @@ from torch import Tensor
 from cfx.calibration import contract as first
 from cfx.calibration.objectives import FrameValues, Objective, root_mean_square
 from cfx.calibration.rmse import SpeedRmse
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx_contracts import check_contract
 from cfx_contracts import objectives as checks
 
@@ -148,4 +148,4 @@ def test_every_statement_has_an_objective_that_breaks_it() -> None:
 
 
 def test_a_good_objective_holds_all_of_them() -> None:
-    check_contract(TheilU())
+    check_contract(TheilInequality())

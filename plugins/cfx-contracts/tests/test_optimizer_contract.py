@@ -61,7 +61,7 @@ class SeedingNumpy(Small):
 
 
 class Numbering(Small):
-    """Draws other points in each chunk."""
+    """Draws other points in each shard."""
 
     def draw(self, problems: int, count: int, n: int, seed: int) -> Tensor:
         return super().draw(problems, count, n, seed + problems)
@@ -178,7 +178,7 @@ BROKEN: dict[str, tuple[Optimizer, Any, str]] = {
         checks.problems_are_independent,
         "must not depend on the problems beside it",
     ),
-    "numbering": (Numbering(), checks.chunks_change_nothing, "never on the result"),
+    "numbering": (Numbering(), checks.shards_change_nothing, "never on the result"),
     "deaf": (Deaf(), checks.evaluates_exactly_what_it_says, "every guess is evaluated"),
     "twice": (Twice(), checks.evaluates_exactly_what_it_says, "not one more"),
     "overfilled": (

@@ -173,7 +173,7 @@ BROKEN: dict[str, tuple[Simulator, Any, str]] = {
     "wishful": (With(Wishful), checks.ends_where_the_last_step_led, "realised"),
     "restless": (With(Restless), checks.no_steps_change_nothing, "stays as it is"),
     "jumping": (With(Jumping), checks.positions_and_speeds_belong_together, "two stories"),
-    "crowding": (With(Crowding), checks.followers_are_independent, "depend on chunks"),
+    "crowding": (With(Crowding), checks.followers_are_independent, "depend on shards"),
     "narrow": (With(Narrow), checks.leaders_and_parameters_broadcast, "must broadcast"),
     "foreseeing": (With(Foreseeing), checks.sees_no_later_frame_of_the_leader, "no future"),
     "forgetting": (With(Forgetting), checks.parts_give_the_whole, "what one call gives"),

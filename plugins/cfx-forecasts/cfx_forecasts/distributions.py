@@ -33,7 +33,7 @@ _OF_SIX = 6
 _ENERGY_STEP_S = 0.5
 """Time between the points of a path in its energy score."""
 
-_ENERGY_CHUNK = 256
+_SCORED_AT_ONCE = 256
 """Origins whose paths are compared with one another at once, which bounds the memory."""
 
 _PSEUDO_COUNT = 0.1
@@ -285,8 +285,8 @@ def _energy(sampled: Array, truth: Array, step: int, dt: float) -> Array:
     if len(sampled) == 1:
         return np.asarray(np.linalg.norm(paths[:, 0] - path, axis=-1) / scale)
     parts = []
-    for first in range(0, len(path), _ENERGY_CHUNK):
-        rows = slice(first, first + _ENERGY_CHUNK)
+    for first in range(0, len(path), _SCORED_AT_ONCE):
+        rows = slice(first, first + _SCORED_AT_ONCE)
         parts.append(
             scoringrules.es_ensemble(path[rows], paths[rows], estimator="fair", backend="numpy")
         )

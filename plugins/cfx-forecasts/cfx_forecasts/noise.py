@@ -39,7 +39,7 @@ def residual_noise(test: HeldOut, parameters: Tensor, *, own: bool) -> tuple[Ten
         own: measured on each driver; otherwise the mean over those of the other folds, or over all
             test drivers where there are no folds.
     """
-    model, windows = test.context.simulator.model, test.context.windows
+    model, windows = test.context.stepper.model, test.context.windows
     lag = windows.stride * test.batch.dt
     found = measure_residuals(model, test.batch, parameters, test.first, lag)
     usual = found.time.nanmean().nan_to_num(composed.RELAXATION_TIME.default)
@@ -67,7 +67,7 @@ def constant_with_noise(
     Raises:
         ConfigError: the model has equations in a simulator only.
     """
-    model, device = context.simulator.model, parameters.device
+    model, device = context.stepper.model, parameters.device
     head = StochasticHead.for_model(model, device).of_acceleration()
     complete = head.completed(parameters).clone()
     for parameter, values in ((composed.RELAXATION_TIME, time), (NOISE_SCALE, scale)):
@@ -82,16 +82,16 @@ def constant_with_noise(
         model_node=context.model_node,
         policy_node={"name": "fixed"},
         windows=context.windows,
-        dt=context.simulator.dt,
+        dt=context.stepper.dt,
         names=tuple(str(number) for number in range(len(complete))),
         base=complete,
     )
 
 
-def can_drive(simulator: Stepper, agent: Agent) -> bool:
+def can_drive(stepper: Stepper, agent: Agent) -> bool:
     """Says whether a simulator takes the steps of the model that an agent drives."""
     try:
-        agent.stepper(simulator)
+        agent.stepper(stepper)
     except ConfigError as error:
         log.info("Left out: %s", error)
         return False

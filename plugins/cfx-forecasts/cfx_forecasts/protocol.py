@@ -135,7 +135,7 @@ class Forecast(FoldsOrFinished):
         Raises:
             ConfigError: one of them is no whole number of steps.
         """
-        dt = context.simulator.dt
+        dt = context.stepper.dt
         named = [("stride", self.settings.stride)]
         named += [("horizons", horizon) for horizon in self.settings.horizons]
         if self.settings.min_history is not None:
@@ -246,7 +246,7 @@ class Forecast(FoldsOrFinished):
             residual["population_residual"] = (test.population, test.network)
         for name, (parameters, network) in residual.items():
             agent = context.constant(FixedPolicy(residual=True), parameters)
-            if can_drive(context.simulator, agent):
+            if can_drive(context.stepper, agent):
                 agents[name] = (agent, network)
         for name, (agent, network) in agents.items():
             found = self._from_origins(test, agent, origins, steps, network, (None,))
@@ -262,7 +262,7 @@ class Forecast(FoldsOrFinished):
         for name, parameters in _constants(test).items():
             noise = residual_noise(test, parameters, own=name == "fixed")
             agent = constant_with_noise(context, parameters, *noise)
-            if can_drive(context.simulator, agent):
+            if can_drive(context.stepper, agent):
                 agents[f"{name}_ar"] = (agent, each)
         if test.policy.core.head.is_stochastic:
             agents["policy"] = (test.policy, test.network)
@@ -290,7 +290,7 @@ class Forecast(FoldsOrFinished):
         if agent is not test.policy:
             base = None  # it has a base for each driver, or needs none
         return forecasts.sample_from_origins(
-            test.context.simulator,
+            test.context.stepper,
             agent,
             Followers(test.batch, network, base, test.policy.context_rule.history_s),
             origins,
@@ -302,7 +302,7 @@ class Forecast(FoldsOrFinished):
 
 def _constants(test: HeldOut) -> dict[str, Tensor]:
     """Returns constant parameters of each test driver, `(P, n)`, that a residual can go with."""
-    if test.context.simulator.model.needs_simulator:
+    if test.context.stepper.model.needs_simulator:
         return {}
     found = {"fixed": test.fixed}
     if test.population is not None:

@@ -140,7 +140,7 @@ class Posterior:
     @property
     def space(self) -> ParameterSpace:
         """The model's parameter space."""
-        return self.segments.simulator.model.space
+        return self.segments.stepper.model.space
 
     @property
     def dimensions(self) -> int:
@@ -182,8 +182,8 @@ class Posterior:
         p = self.segments.parameters(torch.sigmoid(logits))
         errors = SignalErrors(self.signal)
         terms = Terms(errors, ComponentKey(SignalErrors, self.signal))
-        simulator = self.segments.simulator
-        found = simulator.accumulate(self.segments.segments, p, terms, self.stride)
+        stepper = self.segments.stepper
+        found = stepper.accumulate(self.segments.segments, p, terms, self.stride)
         if found is None:
             frames = self.segments.simulated(p, gap=self.signal == "gap")
             found = (errors(*frames[:4])[0][self.stride - 1 :: self.stride],)

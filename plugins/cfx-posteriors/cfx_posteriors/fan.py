@@ -83,7 +83,7 @@ def fan_of(
         parts.append(measured[drivers][..., None] + away.quantile(shares, dim=2).movedim(0, 2))
     return Fan(
         whole.signal,
-        count * stride * whole.segments.simulator.dt,
+        count * stride * whole.segments.stepper.dt,
         whole.counted[..., 0].T > 0,
         calibrated,
         measured,

@@ -320,12 +320,12 @@ def posterior_of(
     pair = torch.arange(len(batch), device=batch.lengths.device)
     last = last.to(pair.device)
     cut = SegmentLosses.of_segments(
-        solver.simulator.for_work(_WORK), solver.objective, batch, pair, pair * 0, last
+        solver.stepper.for_work(_WORK), solver.objective, batch, pair, pair * 0, last
     )
     measured = Segments(*(values.to("cpu", torch.float64) for values in cut.segments))
-    stride = max(1, round(settings.noise_step_s / solver.simulator.dt))
+    stride = max(1, round(settings.noise_step_s / solver.stepper.dt))
     return Posterior(
-        SegmentLosses(cut.simulator, cut.objective, measured),
+        SegmentLosses(cut.stepper, cut.objective, measured),
         ParameterPrior.of(solver.space, settings.prior),
         settings.noise_order,
         min(stride, cut.steps),

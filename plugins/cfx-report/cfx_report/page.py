@@ -50,7 +50,7 @@ def render(runs: Runs, title: str | None = None) -> str:
     for one in registry.installed("section"):
         body = one.attempt(lambda section: _section(environment, section, runs), "")
         if body.strip():
-            sections.append((one.name, one.part, Markup(body)))  # noqa: S704 - a template's
+            sections.append((one.name, one.component, Markup(body)))  # noqa: S704 - a template's
     scripts = inline_scripts([_asset(name) for name in _SCRIPTS])
     return environment.get_template("page.html.j2").render(
         title=title or _title(runs.jobs),
@@ -80,7 +80,7 @@ def _environment(runs: Runs) -> Environment:
 
     environment.globals |= {
         "drawn": functools.partial(_drawn, environment),
-        "caption": lambda name: drawing.figure_named(name).part.caption,
+        "caption": lambda name: drawing.figure_named(name).component.caption,
         "lacking": lambda file, what: lacking(runs.jobs, file, what),
         "most": MOST,
         "next_number": itertools.count(1).__next__,
@@ -98,7 +98,7 @@ def _drawn(environment: Environment, name: str, job: Result) -> Any:
     if drawn is None:
         return ""
     figure: Any = environment.globals["figure"]
-    return figure({"": View(drawn)}, found.part.title)
+    return figure({"": View(drawn)}, found.component.title)
 
 
 def _section(environment: Environment, section: Section, runs: Runs) -> str:

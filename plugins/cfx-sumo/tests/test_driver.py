@@ -694,16 +694,16 @@ def test_in_sumo_a_policy_drives_as_in_memory(
     )
     checkpoint.save_agent(policy, tmp_path / "policy")
     first, own = torch.tensor([0, 215, 100, frames - 100]), torch.arange(4)
-    simulator, base = MemoryStepper(model, 0.1), model.space.defaults().expand(4, -1)
+    stepper, base = MemoryStepper(model, 0.1), model.space.defaults().expand(4, -1)
     loops = {
         "policy": simulate_closed_loop(
-            simulator, policy, Followers(batch, own, base=base, history=history), first
+            stepper, policy, Followers(batch, own, base=base, history=history), first
         ),
         "default": simulate_closed_loop(
-            simulator, _baseline(policy, DefaultPolicy(), 4), Followers(batch, own), first
+            stepper, _baseline(policy, DefaultPolicy(), 4), Followers(batch, own), first
         ),
         "fixed": simulate_closed_loop(
-            simulator, _baseline(policy, FixedPolicy(), 4), Followers(batch, own), first
+            stepper, _baseline(policy, FixedPolicy(), 4), Followers(batch, own), first
         ),
     }
     evaluation = evaluate(

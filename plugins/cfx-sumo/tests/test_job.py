@@ -87,10 +87,10 @@ def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
 def test_a_signal_ends_a_calibration_in_sumo_and_its_processes(
     how: signal.Signals, code: int, tmp_path: Path
 ) -> None:
-    several_chunks = ["data.max_pairs=8", "optimizer.samples=4096", "simulator.memory_mb=16"]
+    several_shards = ["data.max_pairs=8", "optimizer.samples=4096", "simulator.memory_mb=16"]
     sumo = ["model=krauss_sumo", "simulator=sumo", "cache.enabled=false", "hydra.run.dir=job"]
     job = subprocess.Popen(
-        [sys.executable, "-m", "cfx", *QUICK, *several_chunks, *sumo],
+        [sys.executable, "-m", "cfx", *QUICK, *several_shards, *sumo],
         cwd=tmp_path,
         env=ENVIRONMENT | {"TMPDIR": str(tmp_path)},
         stdout=subprocess.DEVNULL,

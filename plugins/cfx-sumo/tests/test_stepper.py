@@ -83,9 +83,9 @@ def case() -> Case:
 def in_sumo(model: DrivingModel, **settings: int) -> Iterator[object]:
     from cfx_sumo.simulation.stepper import SumoStepper
 
-    simulator = SumoStepper(model, DT, **({"workers": 1} | settings))
-    yield simulator
-    simulator.close()
+    stepper = SumoStepper(model, DT, **({"workers": 1} | settings))
+    yield stepper
+    stepper.close()
 
 
 @pytest.fixture(scope="module")

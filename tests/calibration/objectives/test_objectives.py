@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from cfx.calibration.huber import SpeedHuber
 from cfx.calibration.mixed import Mixed
 from cfx.calibration.rmse import GapRmse, SpeedRmse
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.errors import ConfigError
@@ -26,8 +26,8 @@ SHIPPED = {
     "gap_rmse": GapRmse(),
     "mixed": Mixed(),
     "mixed, speed alone": Mixed(gap_weight=0.0),
-    "theil_u": TheilU(),
-    "theil_u of gaps": TheilU(signal="gap"),
+    "theil_u": TheilInequality(),
+    "theil_u of gaps": TheilInequality(signal="gap"),
     "speed_huber": SpeedHuber(delta=0.5),
 }
 
@@ -76,9 +76,9 @@ def test_each_is_its_formula(seed: int, frames: int, size: float) -> None:
 def test_theils_u_lies_between_0_and_1() -> None:
     one, zero = torch.ones(5, dtype=torch.float64), torch.zeros(5, dtype=torch.float64)
     counted = torch.ones(5)
-    assert TheilU()(FrameValues(one, one, zero, one, 0.1), counted) == 1.0
-    assert TheilU()(FrameValues(one, one, one, zero, 0.1), counted) == 0.0
-    assert TheilU()(FrameValues(zero, one, zero, zero, 0.1), counted) == 0.0
+    assert TheilInequality()(FrameValues(one, one, zero, one, 0.1), counted) == 1.0
+    assert TheilInequality()(FrameValues(one, one, one, zero, 0.1), counted) == 0.0
+    assert TheilInequality()(FrameValues(zero, one, zero, zero, 0.1), counted) == 0.0
 
 
 def test_nothing_that_counts_is_no_loss() -> None:

@@ -84,7 +84,7 @@ def test_a_wrong_number_of_evaluations_is_the_plugins_mistake() -> None:
         minimize(distance, optimizer=Miscounting())
 
 
-def test_chunks_respect_the_memory_bound() -> None:
+def test_shards_respect_the_memory_bound() -> None:
     problems = Problems(distance, torch.zeros(10, 1))
     Listed().minimize(problems, torch.full((10, 1, 1), 0.5), seed=0, memory=700)
     sizes = [len(asked) for asked in problems.asked]

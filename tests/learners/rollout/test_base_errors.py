@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from cfx.calibration.rmse import GapRmse
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.learners.rollout import loss
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
 from cfx.learners.rollout.loss import BaseErrors
@@ -21,15 +21,15 @@ def test_errors_of_the_base_are_those_of_constant_parameters() -> None:
     data = training_data(networks=1, base=TRUE)
     errors = BaseErrors.of(data, placed(data, gru(), 0.0), 12)
     # The true parameters drive as the drivers did.
-    with_history = errors.over_windows[errors.own]
+    with_history = errors.over_windows[errors.driver_row]
     assert float(with_history[..., :30, 0].max()) < 1e-3
     result = untrained(replace(data, pairs=replace(data.pairs, base=None)), gru())
     found = loop(result, data, gru())
     squares = (found.speed - data.batch.follower_speed).square()[:, 1:]
     near = {"rtol": 1e-3, "atol": 1e-3}
-    full = errors.over_pair[errors.pooled][0, :, 0].double()
+    full = errors.over_pair[errors.pooled_row][0, :, 0].double()
     torch.testing.assert_close(full, squares.mean(1).sqrt(), **near)
-    horizon = errors.over_windows[errors.pooled][0, :, 0, 0].double()
+    horizon = errors.over_windows[errors.pooled_row][0, :, 0, 0].double()
     torch.testing.assert_close(horizon, squares[:, :60].mean(1).sqrt(), **near)
 
 
@@ -53,7 +53,7 @@ def test_divisors_grow_with_the_scale_of_a_trajectory_where_the_objective_has_a_
     one, two = errors.over_horizon(batch), errors.over_horizon(scaled)
     torch.testing.assert_close(two.objective - 0.2, 2.0 * (one.objective - 0.2))
     torch.testing.assert_close(two.gap - 1.0, 2.0 * (one.gap - 1.0))
-    theil = BaseErrors.of(replace(data, objective=TheilU()), dataset, 12)
+    theil = BaseErrors.of(replace(data, objective=TheilInequality()), dataset, 12)
     assert torch.equal(theil.over_horizon(batch).objective, theil.over_horizon(scaled).objective)
 
 
@@ -63,7 +63,7 @@ def test_networks_that_share_pairs_and_bases_share_their_errors() -> None:
     assert len(dataset.recordings.batch) == 6
     errors = BaseErrors.of(data, dataset, 12)
     assert len(errors.over_windows) == 12
-    assert torch.equal(errors.own[0], errors.own[2])
+    assert torch.equal(errors.driver_row[0], errors.driver_row[2])
     one = data.pairs.split.frame[:6].clone()
     one[0] = 120  # one network's training part of a pair ends earlier
     split = replace(data.pairs.split, frame=torch.cat([one, data.pairs.split.frame[6:]]))
@@ -95,10 +95,10 @@ def test_a_kernel_finds_the_errors_that_pytorch_does(monkeypatch: pytest.MonkeyP
     data = training_data(networks=2, base=TRUE.repeat(2, 1))
     dataset = placed(data, gru(), 0.0)
     eager = BaseErrors.of(
-        replace(data, simulator=MemoryStepper(Krauss(), 0.1, compile="never")), dataset, 12
+        replace(data, stepper=MemoryStepper(Krauss(), 0.1, compile="never")), dataset, 12
     )
     kernel = BaseErrors.of(
-        replace(data, simulator=MemoryStepper(Krauss(), 0.1, compile="always")), dataset, 12
+        replace(data, stepper=MemoryStepper(Krauss(), 0.1, compile="always")), dataset, 12
     )
     torch.testing.assert_close(kernel.over_windows, eager.over_windows)
     torch.testing.assert_close(kernel.over_pair, eager.over_pair)

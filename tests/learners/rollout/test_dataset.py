@@ -49,7 +49,7 @@ def test_networks_of_an_ensemble_keep_other_drivers_for_validation_and_read_alik
     assert torch.equal(mean[:5], mean[:1].expand(5, -1))
     assert torch.equal(mean[5:], mean[5:6].expand(5, -1))
     errors = BaseErrors.of(data, dataset, 12)
-    assert errors.own.shape == errors.pooled.shape == (10, 6)
+    assert errors.driver_row.shape == errors.pooled_row.shape == (10, 6)
 
 
 def test_a_network_of_few_drivers_keeps_the_end_of_their_trajectories() -> None:

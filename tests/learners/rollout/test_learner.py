@@ -14,7 +14,7 @@ from cfx.calibration.huber import SpeedHuber
 from cfx.calibration.mixed import Mixed
 from cfx.calibration.objectives import Objective
 from cfx.calibration.rmse import GapRmse, SpeedRmse
-from cfx.calibration.theil_u import TheilU
+from cfx.calibration.theil_u import TheilInequality
 from cfx.data.pairs import PairBatch
 from cfx.errors import ConfigError
 from cfx.learners.base import TrainingPairs, TrainingResult
@@ -85,7 +85,7 @@ def test_a_residual_policy_starts_where_the_driver_is_and_drives_better() -> Non
         first = (found.speed[:, 1] - found.speed[:, 0]) / 0.1
         measured = data.batch.follower_acceleration[:, 100]
         torch.testing.assert_close(first, measured, rtol=0, atol=1e-5)
-        assert found.parameters.shape[-1] == len(data.simulator.model.space)
+        assert found.parameters.shape[-1] == len(data.stepper.model.space)
         errors.append(error(found, data, first=100))
     assert errors[1] < 0.6 * errors[0]
 
@@ -95,7 +95,7 @@ _losses_of_objectives: list[list[float]] = []
 
 @pytest.mark.parametrize(
     "objective",
-    [SpeedRmse(), GapRmse(), Mixed(), TheilU(), SpeedHuber()],
+    [SpeedRmse(), GapRmse(), Mixed(), TheilInequality(), SpeedHuber()],
     ids=lambda o: type(o).__name__,
 )
 def test_it_minimises_the_objective_of_the_job(objective: Objective) -> None:
@@ -278,7 +278,7 @@ def test_w99_learns_through_smoothed_regimes_and_drives_exactly() -> None:
     options = QUICK | {"epochs": 4, "steps": 8, "patience": None}
     result = RolloutLearner(**options).fit(policy, data)
     assert error(loop(result, data, policy, first=50), data, first=50) < 0.9 * before
-    assert data.simulator.model.temperature == 0
+    assert data.stepper.model.temperature == 0
 
 
 @pytest.mark.slow
@@ -325,7 +325,7 @@ def test_a_simulator_without_gradients_is_refused() -> None:
     class Blind(MemoryStepper):
         differentiable = False
 
-    data = replace(training_data(networks=1), simulator=Blind(Krauss(), 0.1))
+    data = replace(training_data(networks=1), stepper=Blind(Krauss(), 0.1))
     message = r"this learner needs gradients, and the simulator has none; choose .*=imitation"
     with pytest.raises(ConfigError, match=message):
         RolloutLearner(**QUICK).fit(gru(), data)

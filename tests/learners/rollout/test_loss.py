@@ -8,7 +8,7 @@ import torch
 from cfx.calibration.rmse import SpeedRmse
 from cfx.learners.rollout.loss import Divisors, TrajectoryLoss
 from cfx.learners.rollout.settings import LossSettings
-from cfx.learners.rollout.window import Measured, Segment
+from cfx.learners.rollout.window import MeasuredFrames, Segment
 
 DT = 0.1
 FRAMES = 8
@@ -19,7 +19,7 @@ def segment(jerk: float, paths: int = 1) -> Segment:
     time = DT * torch.arange(FRAMES, dtype=torch.float64)
     measured = (10.0 + 0.5 * jerk * time**2).expand(1, paths, FRAMES)
     gap = torch.full_like(measured, 20.0)
-    known = Measured(measured, gap, torch.ones_like(measured))
+    known = MeasuredFrames(measured, gap, torch.ones_like(measured))
     return Segment(measured + 1.0, gap + 2.0, known, None)
 
 

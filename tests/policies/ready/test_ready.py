@@ -10,7 +10,7 @@ import torch
 
 import cfx
 from cfx.app import cli
-from cfx.app.job.steps import Parts, complete, make_protocol
+from cfx.app.job.steps import JobComponents, complete, make_protocol
 from cfx.errors import DataError
 from cfx.policies import checkpoint, ready
 from tests.histories import observed
@@ -157,7 +157,7 @@ def test_a_policy_that_answers_what_its_model_does_not_use_is_tested_all_the_sam
         }
     )
     protocol = make_protocol(config)
-    model = Parts.of(complete(config, protocol), protocol).model
+    model = JobComponents.of(complete(config, protocol), protocol).model
     assert model.space.names == cfx.load("cfx://i80-w99").policy.core.head.model_space.names
     assert "cc9" in model.space.names
 

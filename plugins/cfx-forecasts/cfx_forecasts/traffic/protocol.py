@@ -201,14 +201,14 @@ class TrafficProtocol(FoldsOrFinished):
             ConfigError: a setting does not fit the vehicles or the model, which is known before any
                 work begins.
         """
-        s, model = self.settings, context.simulator.model
+        s, model = self.settings, context.stepper.model
         if model.needs_simulator:
             raise ConfigError(
                 f"protocol=traffic: model={context.model_node['name']} has equations in"
                 f" {model.needs_simulator} only, and cfx simulates the roads itself; choose a model"
                 " that cfx has, such as krauss or idm"
             )
-        self._check(length, context.windows.stride * context.simulator.dt)
+        self._check(length, context.windows.stride * context.stepper.dt)
         generator = torch.Generator().manual_seed(context.seed * _DRAWN + 1)
         parts = [
             ring_roads(s.densities, s.vehicles, s.repetitions, length, s.perturbation, generator)
@@ -272,7 +272,7 @@ class TrafficProtocol(FoldsOrFinished):
                 chance = torch.Generator().manual_seed(context.seed * _DRAWN + 3)
             state = kind.state.of(drivers)
             driven[method] = simulate_roads(
-                context.simulator.model, kind.agent, state, lanes, s.duration, chance
+                context.stepper.model, kind.agent, state, lanes, s.duration, chance
             )
         return traffic_of(driven, lanes, s.settle, test.batch)
 
@@ -280,7 +280,7 @@ class TrafficProtocol(FoldsOrFinished):
         """Returns who drives, by method."""
         s, context = self.settings, test.context
         kinds: dict[str, _Kind] = {}
-        if context.simulator.model.has_constant_baseline:
+        if context.stepper.model.has_constant_baseline:
             constants = {"fixed": test.fixed}
             pooled = _pooled(test)
             if pooled is not None:
@@ -339,7 +339,7 @@ def _constant_kinds(
         ones = torch.ones_like(parameters[:, 0])
         time, scale = noise[0] * ones, noise[1] * ones
     noisy = constant_with_noise(context, parameters, time, scale)
-    if can_drive(MemoryStepper(context.simulator.model, noisy.dt), noisy):
+    if can_drive(MemoryStepper(context.stepper.model, noisy.dt), noisy):
         kinds[f"{name}_ar"] = _Kind(noisy, noisy.begin(each), draws=True)
     return kinds
 

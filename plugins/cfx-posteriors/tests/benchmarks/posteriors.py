@@ -419,7 +419,7 @@ def reference(name: str) -> Iterator[str]:
     prior, limits = posterior.prior, MODELS[name].limits
     assert prior.center is not None
     assert limits is not None
-    center, dt = prior.center.numpy(), posterior.segments.simulator.dt
+    center, dt = prior.center.numpy(), posterior.segments.stepper.dt
     with jax.enable_x64(True):
         for driver in range(REFERENCES):
             one = posterior.take(torch.tensor([driver])).segments.segments

@@ -121,7 +121,7 @@ def labels_of(
     """Return the labels of some pairs, spread evenly over those that have driver-specific ones.
 
     Args:
-        labels: as `Labels.to_frame` returns it.
+        labels: as `WindowLabels.to_frame` returns it.
         pairs: a row per pair and method with columns `pair_id`, `method`, `parameter_NAME`.
         axes: the tuned parameters.
 

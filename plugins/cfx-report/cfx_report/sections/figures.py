@@ -187,8 +187,8 @@ class FurtherSection(Section):
 {% for figure in further %}
 {% set folds = drawn_folds(figure.name, runs.jobs) | trim %}
 {% if folds %}
-<h3>{{ figure.part.title }}</h3>
-<p>{{ figure.part.caption }}</p>
+<h3>{{ figure.component.title }}</h3>
+<p>{{ figure.component.caption }}</p>
 {{ folds }}
 {% endif %}
 {% endfor %}
@@ -198,7 +198,7 @@ class FurtherSection(Section):
         """Return the figures."""
         shown: set[str] = set()
         for section in registry.installed("section"):
-            shown |= set(section.part.figures)
+            shown |= set(section.component.figures)
         drawn: set[str] = set()
         for job in runs.jobs:
             drawn |= {path.stem for path in job.figures}

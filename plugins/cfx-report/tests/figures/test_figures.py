@@ -101,8 +101,8 @@ def test_every_figure_keeps_its_contract(
     settings = dict(mpl.rcParams)
     drawn = draw_figure(one, everything)
     assert drawn is not None
-    assert one.part.title
-    assert one.part.caption.endswith(".")
+    assert one.component.title
+    assert one.component.caption.endswith(".")
     for axes in drawn.axes:
         named = axes.get_xlabel() or axes.get_ylabel() or axes.get_title(loc="left")
         shared = drawn.get_supxlabel() or drawn.get_supylabel()

@@ -2,7 +2,7 @@
 
     python -m plugins.cfx-sumo.tests.benchmarks.sumo_loop --runs 100
 
-Each run is a process of its own: eight pairs in 2, 3, 4 or 8 chunks, on two cores that share two
+Each run is a process of its own: eight pairs in 2, 3, 4 or 8 shards, on two cores that share two
 SUMO processes. Its results are compared, byte by byte, with those of one core. After them, a fifth
 as many runs are sent SIGTERM, each a little later than the one before. Prints one line for each
 difference, each run that takes too long, each other way to end, each process that stays; and how
@@ -24,7 +24,7 @@ import psutil
 
 from tests.scripts import ENVIRONMENT
 
-PAIRS, SAMPLES, CHUNKS = 8, 12, (2, 3, 4, 8)
+PAIRS, SAMPLES, SHARDS = 8, 12, (2, 3, 4, 8)
 RESULTS = ("pairs.csv", "metrics.json")
 MODELS = {
     "krauss_sumo": ("model=krauss_sumo",),
@@ -59,12 +59,12 @@ from cfx.calibration.optimizers import base
 base._LOSSES_AT_ONCE = {SAMPLES} * -(-{PAIRS} // int(sys.argv.pop(1)))
 share = base.share
 def counting(solve, starts, **more):
-    Path("chunks").write_text(str(len(starts)))
+    Path("shards").write_text(str(len(starts)))
     return share(solve, starts, **more)
 base.share = counting
 sys.exit(cli.main())
 """
-"""Bounds the problems of a chunk, which needs a large file of pairs otherwise."""
+"""Bounds the problems of a shard, which needs a large file of pairs otherwise."""
 
 TOO_LONG = 300.0
 """A run that has not ended after as many seconds hangs."""
@@ -73,12 +73,12 @@ TOO_LONG = 300.0
 class Run:
     """One process that calibrates, in a folder of its own."""
 
-    def __init__(self, folder: Path, model: str, chunks: int, *more: str) -> None:
+    def __init__(self, folder: Path, model: str, shards: int, *more: str) -> None:
         folder.mkdir()
-        self.folder, self.chunks = folder, chunks
-        self.name = f"{folder.name}: {model}, {chunks} chunks"
+        self.folder, self.shards = folder, shards
+        self.name = f"{folder.name}: {model}, {shards} shards"
         self.process = subprocess.Popen(
-            [sys.executable, "-c", PROGRAM, str(chunks), *JOB, *MODELS[model], *more],
+            [sys.executable, "-c", PROGRAM, str(shards), *JOB, *MODELS[model], *more],
             cwd=folder,
             env=ENVIRONMENT | {"TMPDIR": str(folder)},
             stdout=subprocess.DEVNULL,
@@ -114,13 +114,13 @@ def main(runs: int, scratch: Path) -> list[str]:
     for number in range(runs):
         model = list(MODELS)[number % 5 > 2]
         began = time.monotonic()
-        run = Run(scratch / f"{number}", model, CHUNKS[number % 4], "cores=2")
+        run = Run(scratch / f"{number}", model, SHARDS[number % 4], "cores=2")
         said = run.end(0)
         seconds[model] = time.monotonic() - began
         if not said and run.results() != expected[model]:
             said = f"{run.name}: other results than with one core"
-        if not said and (run.folder / "chunks").read_text() != str(run.chunks):
-            said = f"{run.name}: another number of chunks"
+        if not said and (run.folder / "shards").read_text() != str(run.shards):
+            said = f"{run.name}: another number of shards"
         wrong.append(said)
         print(f"{run.name}: {said or 'equal'}, {seconds[model]:.0f} s", flush=True)
         shutil.rmtree(run.folder)
@@ -130,7 +130,7 @@ def main(runs: int, scratch: Path) -> list[str]:
         run = Run(
             scratch / f"told_{number}",
             model,
-            CHUNKS[number % 4],
+            SHARDS[number % 4],
             "cores=2",
             "optimizer.samples=4096",
         )

@@ -96,14 +96,14 @@ def test_pair_runs_in_sumo(benchmark: Any) -> None:
     from cfx_sumo.simulation.stepper import SumoStepper
 
     case, cores = Case(), len(os.sched_getaffinity(0))
-    simulator = SumoStepper(case.model, DT)
+    stepper = SumoStepper(case.model, DT)
 
     def drive() -> Tensor:
-        return simulator.advance(simulator.begin(case.start), case.leader, case.p)[2]
+        return stepper.advance(stepper.begin(case.start), case.leader, case.p)[2]
 
     speed = drive()  # the processes have started
     benchmark.pedantic(drive, rounds=4)
-    simulator.close()
+    stepper.close()
     rate = RUNS / benchmark.stats.stats.median
     begin = time.perf_counter()
     with ThreadPoolExecutor(cores) as pool:

@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import huber_loss
 
+from cfx.learners.compiled.elementwise import Elementwise
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import Unsupported
-from cfx.simulation.kernel.elementwise import Elementwise
 
 pytestmark = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C++ compiler")
 

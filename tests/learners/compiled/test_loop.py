@@ -12,7 +12,8 @@ from torch import Tensor
 from cfx.core.threads import cores_limit, limit_cores
 from cfx.data.pairs import PairBatch
 from cfx.learners.base import TrainingData
-from cfx.learners.rollout import RolloutSettings, scan, shard
+from cfx.learners.compiled import loop
+from cfx.learners.rollout import RolloutSettings, shard
 from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.module import RolloutModule
 from cfx.learners.rollout.window import GradientPath
@@ -36,7 +37,7 @@ pytestmark = pytest.mark.skipif(compiler.find_compiler() is None, reason="no C++
 @pytest.fixture(autouse=True)
 def all_windows(monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets gradients go back through all windows that are observed."""
-    monkeypatch.setattr(scan, "_REMEMBERED", 1_000)
+    monkeypatch.setattr(loop, "_BACK_THROUGH", 1_000)
 
 
 SETTINGS: dict[str, Any] = {"compile": "always", "horizon": 6, "draws": 3}
@@ -46,7 +47,7 @@ def module(data: TrainingData, policy: Policy, **options: Any) -> RolloutModule:
     """Returns a module whose networks answer something."""
     settings = RolloutSettings(**(QUICK | options))
     generator = torch.Generator().manual_seed(0)
-    head = head_class(settings.head).for_model(data.simulator.model)
+    head = head_class(settings.head).for_model(data.stepper.model)
     dataset = RolloutDataset.of(data, policy, head, settings, generator)
     network = shard.untrained(policy, dataset, head, generator)
     return module_with(network, dataset, data, settings, policy)
@@ -57,9 +58,9 @@ def both(built: Any, path: Any) -> list[list[Tensor]]:
     step = built.training_window
     batch = built.sampler.training(3)
     divisors = built.shard.errors.over_horizon(batch)
-    scans, found = built.scans, []
-    for used in ({}, scans):
-        built.scans = used
+    loops, found = built.compiled, []
+    for used in ({}, loops):
+        built.compiled = used
         built.network.zero_grad()
         losses = []
         for loss in built.trajectory_losses(step, batch, 6, divisors, path):
@@ -71,7 +72,7 @@ def both(built: Any, path: Any) -> list[list[Tensor]]:
             if weight.grad is not None:
                 gradients.append(weight.grad.clone())
         found.append([*losses, *gradients])
-    built.scans = scans
+    built.compiled = loops
     return found
 
 
@@ -96,7 +97,7 @@ def test_losses_and_gradients_are_those_of_pytorch(
     policy = kind(inputs=INPUTS, hidden_size=8, start="middle", **options)
     data = training_data(model=model, networks=2)
     built = module(data, policy, **(SETTINGS | settings))
-    assert built.training_window in built.scans
+    assert built.training_window in built.compiled
     eager, compiled = both(built, path)
     assert len(eager) == len(compiled) > len(list(built.network.parameters()))
     for one, two in zip(eager, compiled, strict=True):
@@ -110,7 +111,7 @@ def test_further_signals_are_compiled_too() -> None:
         data = training_data(networks=2)
         pairs = with_surroundings(wavy_pairs(Krauss(), TRUE, frames=260))
         built = module(replace(data, recorded=PairBatch.of(pairs)), policy, **SETTINGS)
-        assert built.training_window in built.scans
+        assert built.training_window in built.compiled
         eager, compiled = both(built, GradientPath(0.9, 1.0))
     for one, two in zip(eager, compiled, strict=True):
         torch.testing.assert_close(two, one, rtol=2e-3, atol=2e-3 * float(one.abs().max()))
@@ -145,7 +146,7 @@ def test_validation_is_that_of_pytorch() -> None:
     built = module(training_data(networks=2), policy, **(SETTINGS | {"validation": 0.3}))
     with torch.no_grad():
         compiled = built.validation_loss()
-        built.scans = {}
+        built.compiled = {}
         torch.testing.assert_close(compiled, built.validation_loss(), rtol=1e-4, atol=1e-5)
 
 
@@ -157,7 +158,7 @@ def test_gradients_go_back_through_the_last_windows_observed(
     built = module(training_data(networks=1), policy, **SETTINGS)
     path = GradientPath(0.8, 0.5)
     _, whole = both(built, path)
-    monkeypatch.setattr(scan, "_REMEMBERED", 10)
+    monkeypatch.setattr(loop, "_BACK_THROUGH", 10)
     _, last = both(built, path)
     assert torch.equal(whole[0], last[0])
     for one, two in zip(whole[1:], last[1:], strict=True):

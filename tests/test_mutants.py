@@ -1,0 +1,61 @@
+"""Mutants change what runs, and verdicts belong to what was changed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests import mutants
+from tests.mutants import Mutant, Verdict
+
+SOURCE = '''"""A module."""
+
+from __future__ import annotations
+
+
+def longer(a: int | None, b: int) -> bool:
+    return a is not None and a > b
+'''
+
+
+@pytest.fixture
+def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Returns a file of a checkout of its own."""
+    pytest.importorskip("cosmic_ray", reason="make mutants installs it")
+    path = tmp_path / "cfx" / "models" / "made.py"
+    path.parent.mkdir(parents=True)
+    path.write_text(SOURCE, encoding="utf-8")
+    monkeypatch.setattr(mutants, "TREE", tmp_path)
+    monkeypatch.setattr(mutants, "FOLDER", tmp_path)
+    return path
+
+
+def test_the_same_seed_draws_the_same_changes_of_what_runs(module: Path) -> None:
+    first = list(mutants.drawn(["models"], 4, seed=3))
+    assert first == list(mutants.drawn(["models"], 4, seed=3))
+    assert len(first) >= 2
+    for mutant in first:
+        changed = mutants.mutated(mutant)
+        assert changed is not None
+        assert changed != SOURCE
+        assert "a: int | None, b: int) -> bool" in changed, "annotations do not run"
+
+
+def test_a_verdict_is_kept_until_its_file_changes(module: Path) -> None:
+    mutant = next(mutants.drawn(["models"], 1, seed=0))
+    mutants.keep(mutants.key_of(mutant), Verdict("killed", "a > b", "a < b"))
+    assert mutants.kept()[mutants.key_of(mutant)].outcome == "killed"
+    module.write_text(SOURCE + "\n\nMORE = 1\n", encoding="utf-8")
+    assert mutants.key_of(mutant) not in mutants.kept()
+
+
+def test_survivors_stand_in_the_table() -> None:
+    killed = Mutant("cfx/models/idm.py", "core/AddNot", 0, 3)
+    survivor = Mutant("cfx/models/w99.py", "core/AddNot", 1, 7)
+    text = mutants.table(
+        [(killed, Verdict("killed", "a", "b")), (survivor, Verdict("survived", "x | y", "x & y"))]
+    )
+    assert "| models | 2 | 1 |" in text
+    assert "| cfx/models/w99.py:7 | `x \\| y` | `x & y` |" in text
+    assert "idm.py" not in text
