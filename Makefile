@@ -9,10 +9,11 @@
 #   make mutants [MUTANTS=300 SEED=0 ROOMS="calibration simulation"]   change the code at random; what no test of its room notices
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
 #   make policies                             train the ready-made policies anew from ../shared/data (two hours)
-#   make dist                                 build cfx and the plugins into dist/, install them into a clean environment, try them
+#   make dist                                 build cfx and the plugins into dist/, install cfx alone into a clean environment, then all, try both
+#   make beside [NAMES=cfx-sumo]              run each distribution's tests where of cfx only the core and what it needs are installed
 #   make docs                                 build the site from docs/ and the docstrings into site/; warnings are errors
 #   make tutorials                            run the tutorials and write their pages anew (a quarter of an hour)
-#   make conf                                 write anew what follows from the code: conf/<group>/<name>.yaml, which plugin brings what, the door's page
+#   make conf                                 write anew what follows from the code: conf/<group>/<name>.yaml, which plugin brings what, the door's page, templates
 #   make lock                                 write constraints.txt anew from what resolves today
 #   make clean                                remove .venv and every cache; outputs/ stays
 
@@ -28,7 +29,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow golden golden-write settings fuzz mutants kills bench policies docs tutorials dist conf lock clean
+.PHONY: run test test-slow golden golden-write settings fuzz mutants kills bench policies docs tutorials dist beside conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -84,14 +85,24 @@ dist: $(VENV)/.ready-test
 	for folder in . plugins/*/; do $(BIN)/python -m build --quiet --outdir dist $$folder || exit 1; done
 	$(BIN)/python -m twine check --strict dist/*
 	$(MAKE) VENV=.venv-dist .venv-dist/.torch
+	.venv-dist/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt dist/cfx_driving-*.whl
+	.ci/alone .venv-dist/bin
 	.venv-dist/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt \
 	  dist/cfx_*.whl "cfx-driving[joblib] @ file://$$(echo $(CURDIR)/dist/cfx_driving-*.whl)"
 	.ci/smoke .venv-dist/bin
 	rm -rf .venv-dist
 
+beside:
+	rm -rf .venv-beside
+	$(MAKE) VENV=.venv-beside .venv-beside/.torch
+	.venv-beside/bin/python -m pip --disable-pip-version-check install --quiet --constraint constraints.txt --editable '.[test]'
+	.ci/beside .venv-beside/bin $(NAMES)
+	rm -rf .venv-beside
+
 conf: $(VENV)/.ready
 	$(BIN)/python -m cfx.app.nodes
 	$(BIN)/python docs/door.py
+	$(BIN)/python plugins/cfx-contracts/templates.py
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
 # What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark, SUMO, traffic.
@@ -139,5 +150,5 @@ lock:
 	rm -rf .venv-lock
 
 clean:
-	rm -rf $(VENV) .venv-lock .venv-dist .mutants .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
+	rm -rf $(VENV) .venv-lock .venv-dist .venv-beside .mutants .mypy_cache .ruff_cache .pytest_cache .hypothesis .benchmarks dist site site.log
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +

@@ -1,6 +1,11 @@
-"""What `cfx.plugin` exports, by what it is for, and where each name lives."""
+"""What `cfx.plugin` exports, by what it is for, and where each name lives.
+
+Base classes and records stand here by their names. Functions and constants that belong together
+are a module each: `canvas.blank(3.9)`, `threads.cores()`.
+"""
 
 # Components and their settings, parameters, the registry
+from .core import distributions as distributions, registry as registry
 from .core.component import (
     API_VERSION as API_VERSION,
     Component as Component,
@@ -8,24 +13,15 @@ from .core.component import (
     content_key as content_key,
     folder_hash as folder_hash,
 )
-from .core.distributions import OWN as OWN, install_line as install_line
 from .core.parameters import (
     Parameter as Parameter,
     ParameterOverride as ParameterOverride,
     ParameterSpace as ParameterSpace,
     squashed as squashed,
 )
-from .core.registry import (
-    KINDS as KINDS,
-    Kind as Kind,
-    add_kind as add_kind,
-    create as create,
-    entries as entries,
-    get as get,
-    installed as installed,
-)
 
 # Datasets: pairs, tables with declared columns, tracks and their pairs, driving style
+from .data import names as names, statements as statements, style as style, tracks as tracks
 from .data.base import (
     Contents as Contents,
     Dataset as Dataset,
@@ -48,13 +44,7 @@ from .data.resampling import COARSE_S as COARSE_S
 from .data.signals import OBSERVED as OBSERVED, SIGNALS as SIGNALS, Signal as Signal
 from .data.sites import with_sites as with_sites
 from .data.style import (
-    ALL_TYPES as ALL_TYPES,
-    CLUSTERS as CLUSTERS,
-    Group as Group,
-    INDICATORS as INDICATORS,
     StyleResult as StyleResult,
-    groups as groups,
-    name_of_indicator as name_of_indicator,
 )
 from .data.table import (
     FileColumn as FileColumn,
@@ -64,31 +54,14 @@ from .data.table import (
     read_table as read_table,
 )
 from .data.tracks import (
-    Marks as Marks,
-    NOBODY as NOBODY,
-    SINGLE_FRAME as SINGLE_FRAME,
     Tracks as Tracks,
-    accelerations as accelerations,
-    changes as changes,
-    count_reasons as count_reasons,
-    distance_driven as distance_driven,
     extract_pairs as extract_pairs,
-    first_that_holds as first_that_holds,
-    runs as runs,
-    totals_by_reason as totals_by_reason,
-    unique_name as unique_name,
-)
-from .data.tracks import (
-    next_in_lane as next_in_lane,
-    rows_ahead as rows_ahead,
-    vehicles_apart as vehicles_apart,
 )
 from .data.units import length_mm as length_mm
-from .data.statements import Statement as Statement, remarks_of as remarks_of
 from .data.whole import remarks_on_leaders as remarks_on_leaders
-from .data.names import name_of as name_of, named_twice as named_twice, names_of as names_of
 
 # Models: states, steps, limits, regimes, what SUMO calls them
+from .models import composed as composed, regimes as regimes
 from .models.base import (
     DrivingModel as DrivingModel,
     Follower as Follower,
@@ -96,25 +69,10 @@ from .models.base import (
     ModelSettings as ModelSettings,
     bumper_gap as bumper_gap,
 )
-from .models.composed import (
-    COMFORTABLE_BRAKING as COMFORTABLE_BRAKING,
-    RELAXATION_TIME as RELAXATION_TIME,
-    SPEED_LIMIT as SPEED_LIMIT,
-    WithSpeedLimit as WithSpeedLimit,
-)
 from .models.limits import (
     LimitSettings as LimitSettings,
     at_limits as at_limits,
     limited_speed as limited_speed,
-)
-from .models.regimes import (
-    SPACING_WIDTH as SPACING_WIDTH,
-    SPEED_WIDTH as SPEED_WIDTH,
-    safe_divisor as safe_divisor,
-    safe_sqrt as safe_sqrt,
-    switches_exactly as switches_exactly,
-    where_below as where_below,
-    where_up_to as where_up_to,
 )
 from .models.vtype import InSumo as InSumo, VType as VType, sumo_speed as sumo_speed
 
@@ -137,11 +95,7 @@ from .simulation.trajectory import (
 )
 
 # Calibration: objectives, optimizers, posteriors
-from .calibration.identifiability import (
-    FLAT_SHARE_PREFIX as FLAT_SHARE_PREFIX,
-    NEARLY_BEST as NEARLY_BEST,
-    flat_shares as flat_shares,
-)
+from .calibration import identifiability as identifiability
 from .calibration.losses import Prior as Prior, SegmentLosses as SegmentLosses
 from .calibration.objectives import FrameValues as FrameValues, Objective as Objective
 from .calibration.optimizers import CandidateLosses as CandidateLosses, Optimizer as Optimizer
@@ -159,6 +113,7 @@ from .calibration.settings import (
 from .calibration.shards import Solver as Solver
 
 # Policies: networks, inputs, heads, agents, checkpoints
+from .policies import valid_range as valid_range
 from .policies.agent import Agent as Agent, AgentState as AgentState
 from .policies.base import (
     ConstantNetwork as ConstantNetwork,
@@ -195,39 +150,19 @@ from .policies.known_drivers import (
     driver_features_of as driver_features_of,
 )
 from .policies.ready import READY_FOLDER as READY_FOLDER
-from .policies.valid_range import (
-    FADED as FADED,
-    RANGE_SIGNALS as RANGE_SIGNALS,
-    share_in_words as share_in_words,
-)
 
 # Learners
+from .learners import curves as curves
 from .learners.base import (
     Learner as Learner,
     TrainingData as TrainingData,
     TrainingResult as TrainingResult,
 )
-from .learners.curves import (
-    first_sampled_epoch as first_sampled_epoch,
-    over_networks as over_networks,
-)
 
 # Evaluation: protocols, metrics, forecasts, statistics, demonstrations
+from .evaluation import forecasts as forecasts, headline as headline, statistics as statistics
 from .evaluation.closed_loop import Followers as Followers, burnt_in as burnt_in
 from .evaluation.demo import DEMO_PAGE as DEMO_PAGE, Demo as Demo
-from .evaluation.forecasts import (
-    LeaderFuture as LeaderFuture,
-    Origins as Origins,
-    Paths as Paths,
-    extrapolated as extrapolated,
-    measured_paths as measured_paths,
-    sample_from_origins as sample_from_origins,
-)
-from .evaluation.headline import (
-    Comparison as Comparison,
-    doubts as doubts,
-    summaries_disagree as summaries_disagree,
-)
 from .evaluation.metrics.base import (
     Metric as Metric,
     MetricInfo as MetricInfo,
@@ -256,26 +191,12 @@ from .evaluation.result import (
 )
 from .evaluation.sites import ALL_SITES as ALL_SITES
 from .evaluation.statistics import (
-    Against as Against,
-    Ranking as Ranking,
     Improvement as Improvement,
-    ranking_of as ranking_of,
-    improvement_statistics as improvement_statistics,
-    mean_interval as mean_interval,
-    verdict as verdict,
 )
 from .evaluation.tables import in_text as in_text
 
 # Results: tables of a job, its folder, where it is tracked
-from .core.job_folder import (
-    examine as examine,
-    optional as optional,
-    parse_json as parse_json,
-    parse_yaml as parse_yaml,
-    read_json as read_json,
-    read_yaml as read_yaml,
-    without_folders as without_folders,
-)
+from .core import job_folder as job_folder
 from .results.config import JobConfig as JobConfig
 from .results.provenance import flatten as flatten
 from .results.figure import JobFigure as JobFigure
@@ -289,7 +210,6 @@ from .results.table import (
     Column as Column,
     ResultTable as ResultTable,
     Tables as Tables,
-    metrics_table as metrics_table,
     stored_tables as stored_tables,
 )
 from .results.tracker import (
@@ -301,105 +221,28 @@ from .results.tracker import (
 )
 
 # Figures of a finished job, and how all figures look
-from .figures.canvas import (
-    Array as Array,
-    DASHES as DASHES,
-    Dash as Dash,
-    HIDDEN as HIDDEN,
-    Line as Line,
-    Paper as Paper,
-    WIDTH as WIDTH,
+from .figures import (
     canvas as canvas,
-    draw_lines as draw_lines,
-    draw_points as draw_points,
-    figure_style as figure_style,
-    finite as finite,
-    hover as hover,
-    hover_text as hover_text,
-    legend_above as legend_above,
-    logarithmic as logarithmic,
-    mark_points as mark_points,
-    method_legend as method_legend,
-    most_across as most_across,
-    on_paper as on_paper,
-    percent_axis as percent_axis,
-    percent_tick as percent_tick,
-    plain_tick as plain_tick,
-    points as points,
-    side_by_side as side_by_side,
-    styled as styled,
-    vehicle_colour as vehicle_colour,
-    wrapped as wrapped,
-    write_note as write_note,
+    colours as colours,
+    drawing as drawing,
+    wording as wording,
 )
-from .figures.drawing import (
-    FIGURE_METADATA as FIGURE_METADATA,
-    draw_figure as draw_figure,
-    figure_named as figure_named,
-    write_figure as write_figure,
-    write_figures as write_figures,
-)
-from .figures.text import (
-    BAND as BAND,
-    CLUSTER_COLOURS as CLUSTER_COLOURS,
-    COLLISION_COLOUR as COLLISION_COLOUR,
-    COLOURS as COLOURS,
-    EDGE as EDGE,
-    FULL_TRAJECTORY as FULL_TRAJECTORY,
-    INK as INK,
-    JOB_COLOURS as JOB_COLOURS,
-    MINUS as MINUS,
-    NOTHING as NOTHING,
-    STEADY as STEADY,
-    TEST as TEST,
-    TRAIN_COLOUR as TRAIN_COLOUR,
-    VALIDATION_COLOUR as VALIDATION_COLOUR,
-    colour_of as colour_of,
-    common_prefix as common_prefix,
-    explained as explained,
-    few_drivers as few_drivers,
-    method_label as method_label,
-    number_text as number_text,
-    percent as percent,
-    percent_or_undefined as percent_or_undefined,
-    plural as plural,
-    pretty_unit as pretty_unit,
-    short_label as short_label,
-    shortened as shortened,
-    unit_label as unit_label,
+from .results.figures import (
+    improvement_bars as improvement_bars,
+    pair_lines as pair_lines,
+    parameter_spread as parameter_spread,
 )
 
 # Sub-commands, formats of `cfx export`, engines; `main` runs a command line
+from .core import engine as engine
 from .app.cli import main as main
 from .core.command import Command as Command, ExportFormat as ExportFormat
 from .core.engine import (
     Engine as Engine,
-    Report as Report,
-    ResultT as ResultT,
-    ShardT as ShardT,
-    Unfit as Unfit,
-    Work as Work,
 )
 
 # Files, progress, the console, threads and processes
-from .core.console import (
-    blank_table as blank_table,
-    console_logging as console_logging,
-    print_table as print_table,
-)
-from .core.files import (
-    atomic_write as atomic_write,
-    path_override as path_override,
-    write_json as write_json,
-    write_output as write_output,
-)
+from .core import console as console, files as files, storage as storage, threads as threads
 from .core.memory import require_memory as require_memory
 from .core.processes import worker_pool as worker_pool
 from .core.progress import Task as Task
-from .core.storage import is_url as is_url, local_folder as local_folder
-from .core.threads import (
-    cores as cores,
-    limit_cores as limit_cores,
-    one_thread as one_thread,
-    own_cores as own_cores,
-)

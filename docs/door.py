@@ -13,13 +13,15 @@ from importlib import import_module
 from pathlib import Path
 
 import cfx
+from cfx.plugin import MODULES
 
 PAGE = Path(__file__).parent / "api" / "plugin.md"
 STUB = Path(cfx.__file__).with_name("plugin.pyi")
 HEAD = """# The door for plugins
 
-All names of `cfx.plugin`, by what they are for. `make conf` writes this page from
-`cfx/plugin.pyi` and the docstrings.
+All names of `cfx.plugin`, by what they are for. Base classes and records are imported by their
+names, helpers by the module that they belong to: `canvas.blank(3.9)`, `threads.cores()`.
+`make conf` writes this page from `cfx/plugin.pyi` and the docstrings.
 """
 
 
@@ -38,10 +40,27 @@ def text() -> str:
         if not isinstance(node, ast.ImportFrom):
             continue
         for alias in node.names:
-            meaning = re.sub(r"\s+", " ", first_sentence(f"cfx.{node.module}", alias.name))
-            lines.append(f"| `{alias.name}` | {meaning.replace('|', chr(92) + '|')} |")
+            if alias.name in MODULES:
+                lines += module_rows(alias.name)
+            else:
+                lines.append(row(alias.name, first_sentence(f"cfx.{node.module}", alias.name)))
     page = "\n".join(lines) + "\n"
     return page.replace("|\n## ", "|\n\n## ")
+
+
+def row(name: str, meaning: str) -> str:
+    """Returns a row of a table."""
+    meaning = re.sub(r"\s+", " ", meaning).replace("|", "\\|")
+    return f"| `{name}` | {meaning} |"
+
+
+def module_rows(name: str) -> list[str]:
+    """Returns the rows of a name that is a module: its own, and one for each name in it."""
+    module = import_module(MODULES[name])
+    rows = [row(name, (module.__doc__ or "").partition("\n\n")[0])]
+    for member in module.__all__:
+        rows.append(row(f"{name}.{member}", first_sentence(module.__name__, member)))
+    return rows
 
 
 def first_sentence(module: str, name: str) -> str:

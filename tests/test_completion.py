@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from cfx.app import cli
+from tests.checkout import needs
 
 
 @pytest.fixture
@@ -23,15 +24,20 @@ def complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 @pytest.mark.parametrize(
     ("line", "words"),
     [
-        ("cfx dr", {"drive"}),
+        ("cfx ga", {"gains"}),
         ("cfx data d", {"describe"}),
-        ("cfx data fetch --f", {"--folder", "--force"}),
+        ("cfx gains --d", {"--digits"}),
+        pytest.param("cfx data fetch --f", {"--folder", "--force"}, marks=needs("cfx-recordings")),
         ("cfx plugins show mod", {"model"}),
-        ("cfx plugins show model kraus", {"krauss", "krauss_sumo"}),
+        ("cfx plugins show model hel", {"helly"}),
         ("cfx policies show i80-w", {"i80-w99"}),
-        ("cfx policies m", {"make"}),
-        ("cfx policies make --w", {"--work"}),
-        ("cfx report outputs/some --tables ", {"latex", "csv"}),
+        ("cfx plugins n", {"new"}),
+        ("cfx plugins new --fo", {"--folder"}),
+        pytest.param("cfx policies m", {"make"}, marks=needs("cfx-report")),
+        pytest.param("cfx policies make --w", {"--work"}, marks=needs("cfx-report")),
+        pytest.param(
+            "cfx report outputs/some --tables ", {"latex", "csv"}, marks=needs("cfx-report")
+        ),
         ("cfx data describe ", set()),  # the shell's own completion of files
         ("cfx nonsense more", set()),
     ],
@@ -42,4 +48,4 @@ def test_words_of_a_line(complete, line: str, words: set[str]) -> None:
 
 def test_the_first_word_may_be_a_sub_command_or_a_group(complete) -> None:
     found = set(complete("cfx "))
-    assert {"plugins", "report", "model=", "policy="} <= found
+    assert {"plugins", "gains", "model=", "policy="} <= found

@@ -90,7 +90,7 @@ def test_a_job_config_cannot_be_changed() -> None:
             "metrics=[rmse_gap,rmse_gap]",
             r"^metrics=.*: 'rmse_gap' stands there twice; write each once",
         ),
-        ("figures.formats=[png,png]", r"^figures\.formats=.*: 'png' stands there twice"),
+        ("figure_formats=[png,png]", r"^figure_formats=.*: 'png' stands there twice"),
         ("style.percentiles=[75,25]", r"^style.*percentiles"),
         ("+style.clster=all", r"^style\.clster: unknown key\. Did you mean 'cluster'\?"),
         ("+sede=1", r"^sede: unknown key\. Did you mean 'seed'\?"),

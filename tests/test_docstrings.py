@@ -11,10 +11,11 @@ from pathlib import Path
 
 import pytest
 
-import cfx_report.section  # noqa: F401 - adds the kind of sections
 from cfx.core import registry
+from tests.checkout import ROOT, require_distributions
 
-ROOT = Path(__file__).resolve().parent.parent
+require_distributions()
+
 CODE = (
     ROOT / "cfx",
     *sorted(path for path in ROOT.glob("plugins/*/*") if path.name.startswith("cfx_")),
@@ -58,8 +59,8 @@ def missing_names(path: Path) -> list[str]:
     it, below that, or where its path says.
     """
     source = path.read_text(encoding="utf-8")
-    kinds = (*registry.KINDS.values(), *registry.SIMPLE_KINDS.values())
-    groups = {registry.API_GROUP, *(kind.entry_points for kind in kinds)}
+    groups = {registry.API_GROUP, registry.KINDS_GROUP}
+    groups |= {kind.entry_points for kind in registry.every_kind().values()}
     missing = []
     for line, text in explanations(source):
         for name in re.findall(r"`([\w./]+)(?:\(.*?\))?`", text):

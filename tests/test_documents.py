@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
 import pkgutil
 import re
 import shlex
@@ -11,22 +10,19 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
-import torch
 import yaml
 
 import cfx
-import cfx_report.section  # noqa: F401 - adds the kind of sections
 from cfx.app.hydra_source import composed
 from cfx.core import registry
 from cfx.data.tidy import write_tidy
-from cfx.models.base import DrivingModel
-from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx_contracts import contract_for
-from tests.checkout import ROOT
-from tests.drives import straight_pairs
+from tests.checkout import ROOT, module_of, require_distributions
 from tests.printed import Reader, all_blocks, blocks
 from tests.test_imports import FLOORS
+
+require_distributions()
 
 COMMANDS = registry.names("command")
 PAGES = sorted(path.relative_to(ROOT).as_posix() for path in (ROOT / "docs").rglob("*.md"))
@@ -94,7 +90,10 @@ def nav_of(entries: Iterable[object]) -> Iterator[str]:
 def test_there_are_commands_to_check() -> None:
     assert len(commands()) >= 40
     assert len(summarised()) == 6
-    first = {command.partition(".")[0] for command in COMMANDS}
+    first = set()
+    for entry in registry.entries("command"):
+        if entry.distribution != "cfx-example":  # whose README says how to call it
+            first.add(entry.name.partition(".")[0])
     assert {call.split()[3] for call in of_sub_commands()} == first
 
 
@@ -115,11 +114,7 @@ def test_the_site_names_pages_that_exist() -> None:
 
 
 def test_the_page_of_the_door_is_made_from_it() -> None:
-    spec = importlib.util.spec_from_file_location("door", ROOT / "docs" / "door.py")
-    assert spec is not None
-    assert spec.loader is not None
-    door = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(door)
+    door = module_of(ROOT / "docs" / "door.py")
     page = door.text()
     assert door.PAGE.read_text(encoding="utf-8") == page, "make conf"
     assert not re.findall(r"^\| `(\w+)` \|\s+\|$", page, flags=re.MULTILINE), "no meaning"
@@ -238,27 +233,14 @@ def test_the_readmes_python_runs(
     assert printed_config.command == fit.command.replace(f"{tmp_path}/", "")
 
 
-def test_the_model_in_the_guide_can_be_simulated() -> None:
-    (block,) = [
-        one for one in blocks("docs/plugins.md", "python") if "class Pipes(DrivingModel)" in one
-    ]
-    names: dict[str, object] = {"__name__": "example"}
-    exec(block, names)  # noqa: S102 - it is our own document
-    kind = names["Pipes"]
-    assert isinstance(kind, type)
-    assert issubclass(kind, DrivingModel)
-    batch = cfx.plugin.PairBatch.of(straight_pairs([600]))
-    leader = cfx.plugin.Leader(
-        batch.leader_position, batch.leader_speed, batch.leader_acceleration, batch.leader_length
-    )
-    start = cfx.plugin.Start(
-        batch.follower_position[:, 0], batch.follower_speed[:, 0], batch.follower_acceleration[:, 0]
-    )
-    out = simulate_follower(kind(), {"headway": 2.0}, leader, start, batch.dt)
-    assert not bool(out.collided.any())
-    torch.testing.assert_close(
-        out.gap[0, -1], torch.tensor(20.0, dtype=torch.float64), atol=0.5, rtol=0
-    )
+def test_the_guides_python_is_the_examples() -> None:
+    shown = blocks("docs/plugins.md", "python")
+    assert len(shown) >= 4
+    for block in shown:
+        head, _, text = block.partition("\n")
+        path = ROOT / head.removeprefix("# ")
+        assert path.is_relative_to(ROOT / "plugins" / "cfx-example"), head
+        assert path.read_text(encoding="utf-8") == text, f"copy {head} into docs/plugins.md"
 
 
 def test_the_table_of_kinds_names_what_is_there() -> None:
@@ -312,11 +294,11 @@ def test_the_forms_of_issues_are_complete(path: Path) -> None:
         assert ("options" in part["attributes"]) == (part["type"] == "dropdown")
 
 
-def guide() -> list[tuple[str, str]]:
-    """Returns the blocks of the guide by which a plugin comes about, in order."""
+def guide() -> list[str]:
+    """Returns the shell's blocks of the guide by which a plugin comes about, in order."""
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
-    section = text.partition("## Writing a plugin\n")[2].partition("\n## API versions")[0]
-    return re.findall(r"^```(sh|python|toml)\n(.*?)^```$", section, flags=re.DOTALL | re.MULTILINE)
+    section = text.partition("## Writing a plugin\n")[2].partition("\n### Components")[0]
+    return re.findall(r"^```sh\n(.*?)^```$", section, flags=re.DOTALL | re.MULTILINE)
 
 
 def test_the_guide_names_what_the_door_has() -> None:
@@ -324,39 +306,26 @@ def test_the_guide_names_what_the_door_has() -> None:
     names = set(re.findall(r"\bcfx\.plugin\.(\w+)", text))
     assert len(names) > 20
     assert names <= set(cfx.plugin.__all__)
-    groups = {
-        kind.entry_points for kind in (*registry.KINDS.values(), *registry.SIMPLE_KINDS.values())
-    }
-    doors = {"cfx.plugin", "cfx.errors", "cfx.sklearn", registry.API_GROUP}
+    groups = {kind.entry_points for kind in registry.every_kind().values()}
+    groups |= {registry.API_GROUP, registry.KINDS_GROUP}
+    doors = {"cfx.plugin", "cfx.errors", "cfx.get", "cfx.sklearn"}
     assert set(re.findall(r"\bcfx\.[a-z]+\b", text)) <= groups | doors
 
 
 def test_the_table_of_simple_kinds_names_what_is_there() -> None:
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     rows = re.findall(r"^\| (\w+) \| `(cfx\.\w+)` \| `([\w.]+)` \|", text, flags=re.MULTILINE)
-    assert {kind for kind, _, _ in rows} == set(registry.SIMPLE_KINDS)
-    for kind, group, base in rows:
-        assert registry.SIMPLE_KINDS[kind].entry_points == group
-        assert pkgutil.resolve_name(base) is pkgutil.resolve_name(registry.SIMPLE_KINDS[kind].base)
+    kinds = registry.every_kind()
+    assert {part for part, _, _ in rows} == set(kinds) - set(registry.KINDS)
+    for part, group, base in rows:
+        assert kinds[part].entry_points == group
+        assert pkgutil.resolve_name(base) is pkgutil.resolve_name(kinds[part].base)
 
 
 @pytest.mark.slow
 def test_the_guide_to_a_plugin_works_as_printed(tmp_path: Path) -> None:
     reader = Reader(tmp_path)
-    steps = guide()
-    shell = [block for language, block in steps if language == "sh"]
-    begin, install_and_run = shell
-    reader.shell(begin)
-    declaration = tmp_path / "cfx-pipes" / "pyproject.toml"
-    for language, block in steps:
-        if language == "python":
-            name = block.partition("\n")[0].removeprefix("# ")
-            (tmp_path / name).write_text(block, encoding="utf-8")
-        elif language == "toml":
-            declaration.write_text(f"{declaration.read_text('utf-8')}\n{block}", encoding="utf-8")
-    reader.shell(install_and_run)
-    outputs = tmp_path / "outputs"
-    report = (outputs / "pipes" / "report.html").read_text(encoding="utf-8")
-    assert "pipes" in report
-    assert "Frames of the test parts" in report
-    assert list(outputs.rglob("figures/speed_errors.png"))
+    for block in guide():
+        reader.shell(block)
+    report = (tmp_path / "outputs" / "mine" / "report.html").read_text(encoding="utf-8")
+    assert "mine" in report

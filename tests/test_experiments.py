@@ -14,17 +14,20 @@ from matplotlib.figure import Figure
 
 import cfx
 from cfx.app import cli, hydra_source, nodes
-from tests.checkout import ROOT
+from tests.checkout import DISTRIBUTIONS, ROOT, is_installed
 
 FOLDER = nodes.conf_dir() / "experiment"
-FOLDERS = [FOLDER, *sorted(ROOT.glob("plugins/*/cfx_*/conf/experiment"))]
+FOLDERS = [FOLDER]
+for distribution in DISTRIBUTIONS:
+    if is_installed(distribution):
+        FOLDERS += (ROOT / "plugins" / distribution).glob("cfx_*/conf/experiment")
 FILES = {
     str(path.relative_to(folder).with_suffix("")): path
     for folder in FOLDERS
     for path in folder.rglob("*.yaml")
 }
 NAMES = sorted(FILES)
-SMALL = ["optimizer=random", "optimizer.samples=32", "figures.enabled=false", "learner.epochs=2"]
+SMALL = ["optimizer=random", "optimizer.samples=32", "figures=none", "learner.epochs=2"]
 
 
 @functools.cache
@@ -96,7 +99,7 @@ def test_one_pair_has_its_table_and_its_speed_plots(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.touch())
-    few = ["data.frames=120", "tracking.enabled=false", "figures.enabled=true"]
+    few = ["data.frames=120", "tracking.enabled=false", "figures=own"]
     result = cfx.run(["experiment=paper/pair", *SMALL, *few])
     assert result.pairs.method.tolist() == ["default", "fixed", "policy"]
     assert "speeds.png" in {path.name for path in result.figures}

@@ -29,7 +29,7 @@ JOB = (
     "optimizer.samples=64",
     "cache.enabled=false",
     "tracking.enabled=false",
-    "figures.enabled=false",
+    "figures=none",
 )
 
 

@@ -32,7 +32,7 @@ from cfx.core import registry
 from cfx.core.threads import cores_limit, limit_cores
 from cfx.simulation.rollout import simulate_follower
 
-QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures.enabled=false"]
+QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures=none"]
 QUICK.append("calibration.prior=none")
 
 State = dict[str, Any]
@@ -312,7 +312,7 @@ mlflow.autolog()
 assert pl.Trainer.fit is not fit, "Lightning logs by itself"
 import cfx
 
-QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures.enabled=false"]
+QUICK = ["debug=quick", "data.max_pairs=3", "learner.epochs=1", "figures=none"]
 QUICK += ["calibration.prior=none", "cores=1"]
 
 def fails(*_):

@@ -10,9 +10,12 @@ import pytest
 import cfx
 from cfx.data.tidy import frame_of, write_tidy
 from cfx.simulation.synthetic import SyntheticDataset
-from cfx_sumo.drive.scenarios import SCENARIOS
 from tests.checkout import ROOT
 from tests.printed import Reader, all_blocks
+
+pytest.importorskip("cfx_sumo", reason="how-tos drive in SUMO")
+
+from cfx_sumo.drive.scenarios import SCENARIOS
 
 PAGES = sorted(path.stem for path in (ROOT / "docs" / "how-to").glob("*.md"))
 RUN = {"sh", "python"}

@@ -28,7 +28,7 @@ from cfx.simulation.synthetic import SyntheticDataset
 JOB = (
     "debug=quick",
     "data.platoon_size=1",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "cache.enabled=false",
 )

@@ -18,11 +18,12 @@ import pytest
 
 import cfx
 import cfx.plugin
-import cfx_report.section  # noqa: F401 - adds the kind of sections
 from cfx.core import registry
+from tests.checkout import ROOT, require_distributions
 from tests.printed import blocks
 
-ROOT = Path(__file__).resolve().parent.parent
+require_distributions()
+
 PLUGINS = sorted(path.parent for path in (ROOT / "plugins").glob("*/pyproject.toml"))
 DOORS = ("cfx", "cfx.plugin", "cfx.errors", "cfx.sklearn")
 """What a plugin may import of cfx. `cfx_contracts` is a door itself: it looks at all that it tests."""
@@ -131,11 +132,12 @@ def test_the_wheel_holds_the_package_its_licence_and_its_entry_points(
 
 @pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
 def test_what_it_announces_is_installed_here_and_loads(plugin: Path) -> None:
-    kinds = (*registry.KINDS.values(), *registry.SIMPLE_KINDS.values())
-    groups = {kind.entry_points: kind.name for kind in kinds}
+    groups = {kind.entry_points: kind.name for kind in registry.every_kind().values()}
     points = project(plugin)["entry-points"]
     assert isinstance(points, dict)
     points.pop(registry.API_GROUP, None)  # the version of the plugin API, which is no component
+    for name, target in points.pop(registry.KINDS_GROUP, {}).items():
+        assert registry.kind_of(name).base == target
     assert set(points) <= set(groups)
     for group, announced in points.items():
         for name, target in announced.items():
@@ -149,18 +151,22 @@ def test_what_it_announces_is_installed_here_and_loads(plugin: Path) -> None:
 def beside_the_doors(path: Path) -> list[str]:
     """Returns what a file uses of cfx that stands behind no door, with the line."""
     wrong = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    opened = set()  # names of the door that are modules, where this file imports them
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module == "cfx.plugin":
+            opened |= {alias.name for alias in node.names} & set(cfx.plugin.MODULES)
+    for node in ast.walk(tree):
         modules: list[tuple[str, str]] = []
         if isinstance(node, ast.Import):
             modules = [(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             modules = [(str(node.module), alias.name) for alias in node.names]
-        elif (
-            isinstance(node, ast.Attribute)
-            and isinstance(node.value, ast.Name)
-            and node.value.id == "cfx"
-        ):
-            modules = [("cfx", node.attr)]
+        elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            if node.value.id == "cfx":
+                modules = [("cfx", node.attr)]
+            elif node.value.id in opened:
+                modules = [(f"cfx.plugin.{node.value.id}", node.attr)]
         for module, name in modules:
             if module.partition(".")[0] == "cfx" and not is_public(module, name):
                 wrong.append(f"{path.name}:{node.lineno}: {module} {name}".rstrip())
@@ -169,6 +175,9 @@ def beside_the_doors(path: Path) -> list[str]:
 
 def is_public(module: str, name: str) -> bool:
     """Says whether a plugin may use `name` of `module`; "" is the module itself."""
+    parent, _, last = module.rpartition(".")
+    if parent == "cfx.plugin" and last in cfx.plugin.MODULES:
+        return name in getattr(cfx.plugin, last).__all__
     if module not in DOORS:
         return False
     return module not in {"cfx", "cfx.plugin"} or name in {"", *sys.modules[module].__all__}
@@ -211,6 +220,7 @@ def test_the_check_of_doors_sees_what_stands_beside_them(tmp_path: Path) -> None
     path.write_text(
         "import cfx\nimport cfx.core.registry\nfrom cfx import nodes, read\n"
         "from cfx.data.describe import describe\nfrom cfx.plugin import DrivingModel, _x, gone\n"
+        "from cfx.plugin import threads\nthreads.cores()\nthreads.gone()\n"
         "from cfx.errors import DataError\ncfx.job\ncfx.get\nimport cfxtra\n"
     )
     assert [text.partition(": ")[2] for text in beside_the_doors(path)] == [
@@ -220,6 +230,7 @@ def test_the_check_of_doors_sees_what_stands_beside_them(tmp_path: Path) -> None
         "cfx.plugin _x",
         "cfx.plugin gone",
         "cfx job",
+        "cfx.plugin.threads gone",
     ]
 
 
@@ -233,6 +244,17 @@ def test_what_a_door_lists_is_there(door: str) -> None:
         _ = module.nonsense
 
 
+def test_the_names_that_are_modules_are_those_of_the_stub() -> None:
+    stub = ast.parse((ROOT / "cfx" / "plugin.pyi").read_text(encoding="utf-8"))
+    modules = {}
+    for node in stub.body:
+        if isinstance(node, ast.ImportFrom):
+            for alias in node.names:
+                place = f"cfx.{node.module}.{alias.name}"
+                if (ROOT / f"{place.replace('.', '/')}.py").is_file():
+                    modules[alias.name] = place
+    assert modules == cfx.plugin.MODULES
+
+
 def test_a_name_stands_in_one_door() -> None:
-    """`get` and `errors` apart: people and authors both ask for components."""
-    assert set(cfx.__all__) & set(cfx.plugin.__all__) == {"get"}
+    assert not set(cfx.__all__) & set(cfx.plugin.__all__)

@@ -144,10 +144,10 @@ def test_show_tells_everything_about_every_component(capsys) -> None:
 @pytest.mark.parametrize(
     ("kind", "name", "use"),
     [
-        ("figure", "drives", "Every job that has what it shows draws it: figures/drives.png."),
+        ("figure", "policy_errors", "figures/policy_errors.png"),
         ("head", "offset", "Choose it with learner.head=offset."),
-        ("export", "onnx", "Choose it with cfx export JOB --to onnx."),
-        ("posterior", "laplace", "Choose it with calibration.posterior=laplace."),
+        ("export", "driver_json", "Choose it with cfx export JOB --to driver_json."),
+        ("posterior", "abc_rejection", "Choose it with calibration.posterior=abc_rejection."),
         ("tracker", "mlflow", "Choose it with tracking.name=mlflow."),
     ],
 )

@@ -33,11 +33,11 @@ MODEL = '''
 
 
 def test_every_kind_has_the_built_in_components_of_pyproject() -> None:
-    assert set(registry.names("model")) >= {"krauss", "w99", "w74"}
+    assert set(registry.names("model")) >= {"krauss", "w99", "helly"}
     assert (
         set(registry.names("dataset"))
         == set(registry.names("data"))
-        >= {"tidy", "ngsim", "synthetic"}
+        >= {"tidy", "pair_csv", "synthetic"}
     )
     built_in = {
         entry.name: entry

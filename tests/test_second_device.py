@@ -25,7 +25,7 @@ _SMALL = [
     "data.frames=80",
     "policy=fixed",
     "optimizer.samples=16",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "cache.enabled=false",
 ]

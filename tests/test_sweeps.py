@@ -484,7 +484,7 @@ def test_twelve_jobs_killed_half_way_end_as_twelve(
         "data.pairs=3",
         "data.frames=200",
         "data.max_pairs=null",
-        "figures.enabled=false",
+        "figures=none",
     ]
     command += ["seed=0,1,2", "policy=gru,fixed", "model=krauss,w99", f"hydra/launcher={launcher}"]
     first = started(command, tmp_path, OMP_NUM_THREADS="1")

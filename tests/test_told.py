@@ -33,7 +33,7 @@ def test_a_setting_that_another_option_has_is_said(capsys: pytest.CaptureFixture
     assert cli.main(["data.path=pairs.csv"]) == 2
     said = capsys.readouterr().err
     assert "data=synthetic has none; choose " in said
-    assert "data=ngsim" in said
+    assert "data=pair_csv" in said
     assert cli.main(["model.variant=vissim"]) == 2
     assert "model=idm has none; choose model=krauss, model=w99 too" in capsys.readouterr().err
 

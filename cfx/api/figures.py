@@ -10,15 +10,15 @@ import pandas as pd
 from matplotlib.figure import Figure
 
 from cfx.data.pairs import Pair
-from cfx.figures.canvas import Line, canvas, draw_lines, method_legend, styled
-from cfx.figures.text import colour_of
+from cfx.figures.canvas import Line, blank, draw_lines, method_legend, styled
+from cfx.figures.colours import colour_of
 
 
 def _panels(
     titles: Sequence[str], methods: tuple[str, str], labels: tuple[str, str]
 ) -> tuple[Figure, Any]:
     """Returns a figure with a legend, and its panels: a row per pair, a column per signal."""
-    figure = canvas(1.0 + 1.9 * len(titles))
+    figure = blank(1.0 + 1.9 * len(titles))
     method_legend(figure, methods)
     panels = figure.subplots(len(titles), 2, squeeze=False)
     for row, title in zip(panels, titles, strict=True):

@@ -227,7 +227,7 @@ class Fit:
         return pd.DataFrame(errors)
 
     def __repr__(self) -> str:
-        from cfx.figures.text import short_label
+        from cfx.figures.wording import short_label
 
         part = "test" if self._context.split < 1 else "train"
         found = self.losses.groupby("method")[f"{part}_rmse_speed"].mean()

@@ -70,7 +70,15 @@ def _run(arguments: Sequence[str]) -> int:
         return 0
     if arguments and re.match(r"\w[^=]*$", arguments[0]):
         return _command(*arguments)
-    return _hydra(arguments)
+    if _is_completion(arguments):
+        from cfx.app import completion
+
+        return completion.answer(arguments)
+    from cfx.app import application
+
+    # Hydra knows no `--verbose`: it is a setting.
+    settings = ["output.verbose=true" if word == "--verbose" else word for word in arguments]
+    return application.start(settings)
 
 
 def _command(name: str, *arguments: str) -> int:
@@ -106,22 +114,10 @@ def _command(name: str, *arguments: str) -> int:
         raise blamed from error
 
 
-def _hydra(arguments: Sequence[str]) -> int:
-    """Runs the Hydra application; completes what a shell asks for (`-sc query=bash`)."""
+def _is_completion(arguments: Sequence[str]) -> bool:
+    """Says whether a shell asks for completions: `-sc query=bash`."""
     asks = len(arguments) == 2 and arguments[0] in {"-sc", "--shell-completion"}
-    if asks and arguments[1].startswith("query="):
-        from cfx.app import completion
-
-        return completion.answer(lambda: _started(arguments))
-    return _started(arguments)
-
-
-def _started(arguments: Sequence[str]) -> int:
-    """Starts the Hydra application, which knows no `--verbose`: it is a setting there."""
-    from cfx.app import application
-
-    settings = ["output.verbose=true" if word == "--verbose" else word for word in arguments]
-    return application.start(settings)
+    return asks and arguments[1].startswith("query=")
 
 
 def program() -> NoReturn:

@@ -12,15 +12,19 @@ import argparse
 import contextlib
 import io
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from typing import TYPE_CHECKING, cast
 
 if TYPE_CHECKING:
     from cfx.core.command import Command
 
 
-def answer(hydra: Callable[[], int]) -> int:
-    """Prints the words with which the line may go on, `hydra` Hydra's; returns the exit code."""
+def answer(arguments: Sequence[str]) -> int:
+    """Prints the words with which the line may go on; returns the exit code.
+
+    Args:
+        arguments: of the program, with which Hydra answers in its turn.
+    """
     from cfx.core import registry
 
     line = os.environ.get("COMP_LINE", "")
@@ -45,9 +49,11 @@ def answer(hydra: Callable[[], int]) -> int:
         print("\n".join(own))
         if own and first:
             return 0
+    from cfx.app import application  # takes ten times as long as all of the above
+
     said = io.StringIO()
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(said):
-        code = hydra()
+        code = application.start(arguments)
     if code == 0:
         print(said.getvalue())
     return 0

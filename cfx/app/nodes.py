@@ -128,7 +128,7 @@ def write_distributions() -> None:
 def distributions_text(root: Path) -> str:
     """Returns the text of `distributions.json` for the checkout in `root`."""
     kinds = [kind for kind in registry.KINDS.values() if kind.name != "metric"]
-    kinds += [registry.SIMPLE_KINDS[name] for name in ("export", "posterior", "tracker")]
+    kinds += [registry.SIMPLE_KINDS[name] for name in ("export", "figure", "posterior", "tracker")]
     groups = {kind.entry_points: kind.group for kind in kinds}
     return json.dumps(options_of_checkout(root, groups), indent=1) + "\n"
 

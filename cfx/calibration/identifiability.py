@@ -26,6 +26,14 @@ from cfx.calibration.rmse import GapRmse, SpeedRmse
 from cfx.core import memory
 from cfx.data.pairs import PairBatch
 
+__all__ = [
+    "FLAT_SHARE_PREFIX",
+    "NEARLY_BEST",
+    "flat_shares",
+]
+"""What plugins may use, as `cfx.plugin.identifiability`."""
+
+
 PLACES = 21
 """G: places between a parameter's bounds, both included."""
 

@@ -175,15 +175,21 @@ def validate(schema: type[Schema], values: Any, *, where: str) -> Schema:
         at: dict[tuple[str, ...], list[Any]] = {}
         for problem in error.errors():
             at.setdefault(_location(values, problem), []).append(problem)
-        sentences = [_sentence(schema, key, at[key], where) for key in _one_a_mistake(at)]
+        sentences = []
+        for key in _one_a_mistake(at):
+            sentences.append(_sentence(schema, key, at[key], where))
         raise ConfigError("\n".join(sentences)) from None
 
 
-def _one_a_mistake(found: Mapping[tuple[str, ...], Any]) -> Iterator[tuple[str, ...]]:
+def _one_a_mistake(problems: Mapping[tuple[str, ...], Any]) -> Iterator[tuple[str, ...]]:
     """Yields the keys to complain of: of a list its first wrong item, not the list as a whole."""
     lists = set()
-    for key in found:
-        if any(other[: len(key)] == key for other in found if other != key):
+    above = set()  # keys of which a part is wrong, so that they need no complaint of their own
+    for key in problems:
+        for length in range(len(key)):
+            above.add(key[:length])
+    for key in problems:
+        if key in above:
             continue
         if key and key[-1].isdecimal():
             if key[:-1] in lists:
@@ -210,7 +216,7 @@ def _sentence(
 ) -> str:
     """Returns what pydantic's errors at a key say: one, or one for each alternative of its type."""
     problem = problems[0]
-    path = ".".join(part for part in [where, *location] if part)
+    path = ".".join(filter(None, [where, *location]))
     if problem["type"] == "extra_forbidden":
         known = sorted(_fields_at(schema, location[:-1]))
         text = f"{path}: unknown key.{nearest(location[-1], known)}"
@@ -219,8 +225,12 @@ def _sentence(
         return text
     if problem["type"] == "missing":
         return f"{path}: a value is required; give one as {path}=..."
-    said = [str(one["msg"]).removeprefix("Value error, ") for one in problems]
-    message = ", or ".join(dict.fromkeys(one.removeprefix("Input ") for one in said))
+    messages = []
+    for alternative in problems:
+        text = str(alternative["msg"]).removeprefix("Value error, ").removeprefix("Input ")
+        if text not in messages:
+            messages.append(text)
+    message = ", or ".join(messages)
     if isinstance(problem["input"], Mapping):
         # Several settings contradict each other; the message names them.
         if message.startswith(path):

@@ -14,6 +14,13 @@ if TYPE_CHECKING:
 
     from rich.table import Table
 
+__all__ = [
+    "blank_table",
+    "console_logging",
+    "print_table",
+]
+"""What plugins may use, as `cfx.plugin.console`."""
+
 
 class ConsoleHandler(logging.Handler):
     """Prints messages of cfx, of packages named `cfx_...` and of Hydra, and warnings of everybody.

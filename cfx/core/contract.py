@@ -53,14 +53,15 @@ def violations(
             "contract checks are made of assertions, which python -O removes;"
             " start python without -O"
         )
-    wanted = {check: inspect.signature(check).parameters for check in checks}
-    unknown = sorted(
-        name for name in further if not any(name in taken for taken in wanted.values())
-    )
+    unknown = set(further)
+    arguments = {}
+    for check in checks:
+        parameters = inspect.signature(check).parameters.keys()
+        arguments[check] = {name: further[name] for name in parameters & further.keys()}
+        unknown -= parameters
     if unknown:
-        raise TypeError(f"no statement of this contract takes {', '.join(unknown)}")
-    for check, taken in wanted.items():
-        given = {name: value for name, value in further.items() if name in taken}
+        raise TypeError(f"no statement of this contract takes {', '.join(sorted(unknown))}")
+    for check, given in arguments.items():
         try:
             check(component, **given)
         except NotApplicable:

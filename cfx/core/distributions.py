@@ -19,6 +19,13 @@ from typing import Any
 
 from cfx.errors import nearest
 
+__all__ = [
+    "OWN",
+    "install_line",
+]
+"""What plugins may use, as `cfx.plugin.distributions`."""
+
+
 OWN = "cfx-driving"
 """cfx's own distribution: no other can replace its components."""
 
@@ -64,11 +71,17 @@ def options_of_checkout(root: Path, groups: Mapping[str, str]) -> dict[str, dict
         for extra, more in extras.items():
             table[f"{distribution}[{extra}]"] = more
             for group, names in more.items():
-                options[group] = [name for name in options.get(group, []) if name not in names]
-        table[distribution] = {group: sorted(names) for group, names in options.items() if names}
-    return {
-        wanted: dict(sorted(table[wanted].items())) for wanted in sorted(table) if table[wanted]
-    }
+                options[group] = sorted(set(options.get(group, ())) - set(names))
+        table[distribution] = options
+    brings = {}
+    for wanted in sorted(table):
+        groups_of_it = {}
+        for group, names in sorted(table[wanted].items()):
+            if names:
+                groups_of_it[group] = sorted(names)
+        if groups_of_it:
+            brings[wanted] = groups_of_it
+    return brings
 
 
 def _options_of_plugin(
@@ -98,8 +111,11 @@ def advice(group: str, name: str, known: Sequence[str]) -> str:
     if (group, name) in options:
         wanted = options[group, name]
         return f" It comes with {wanted}: {install_line(wanted)}"
-    others = [option for where, option in options if where == group]
-    text = nearest(name, [*known, *others])
+    candidates = list(known)
+    for option_group, option in options:
+        if option_group == group:
+            candidates.append(option)
+    text = nearest(name, candidates)
     if known:
         text += f" Known: {', '.join(known)}."
     return text

@@ -13,6 +13,16 @@ from typing import ClassVar, TypeVar
 
 from cfx.core.component import Component
 
+__all__ = [
+    "Report",
+    "ResultT",
+    "ShardT",
+    "Unfit",
+    "Work",
+]
+"""What plugins may use, as `cfx.plugin.engine`."""
+
+
 ShardT = TypeVar("ShardT")
 """What a shard of the work is."""
 

@@ -20,6 +20,15 @@ from pydantic_core import PydanticCustomError
 
 from cfx.errors import OutputError
 
+__all__ = [
+    "atomic_write",
+    "path_override",
+    "write_json",
+    "write_output",
+]
+"""What plugins may use, as `cfx.plugin.files`."""
+
+
 _DAY_S = 86400.0
 """Age in seconds, since the last write, at which another machine's temporary file is removed."""
 

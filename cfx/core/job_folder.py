@@ -19,6 +19,18 @@ import yaml
 
 from cfx.errors import DataError, first_line, without_passwords
 
+__all__ = [
+    "examine",
+    "optional",
+    "parse_json",
+    "parse_yaml",
+    "read_json",
+    "read_yaml",
+    "without_folders",
+]
+"""What plugins may use, as `cfx.plugin.job_folder`."""
+
+
 _LARGEST_MB = 256
 """Texts and weights of a job are smaller."""
 

@@ -145,9 +145,10 @@ class _Workers(Generic[ShardT, ResultT]):
 
     def finished(self) -> Iterator[tuple[int, ResultT]]:
         """Yields the results that have arrived."""
-        for future in [one for one in self.running if one.done()]:
-            number = self.running.pop(future)
-            yield number, future.result()
+        for future in list(self.running):
+            if future.done():
+                number = self.running.pop(future)
+                yield number, future.result()
 
     def end(self, *, kill: bool) -> None:
         """Ends the workers; one that exits normally also ends its libraries' processes."""

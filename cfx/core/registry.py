@@ -26,7 +26,7 @@ import os
 import sys
 import traceback
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
@@ -37,9 +37,18 @@ from pydantic.fields import FieldInfo
 
 from cfx.core.component import API_VERSION, Component, Settings, validate
 from cfx.core.contract import violations
-from cfx.core.distributions import OWN, advice
+from cfx.core.distributions import ALL_OWN, OWN, advice
 from cfx.core.guest import same_environment
 from cfx.errors import CfxError, ConfigError, PluginError, Terminated, in_words, nearest
+
+__all__ = [
+    "KINDS",
+    "create",
+    "entries",
+    "installed",
+]
+"""What plugins may use, as `cfx.plugin.registry`."""
+
 
 log = logging.getLogger(__name__)
 
@@ -48,6 +57,9 @@ R = TypeVar("R")
 
 THIS_PROCESS = "this process"
 """Stands for the distribution of a component that a program has added."""
+
+KINDS_GROUP = "cfx.kinds"
+"""Entry-point group in which a distribution announces a kind of its own: name and base class."""
 
 API_GROUP = "cfx.api"
 """Entry-point group in which a distribution says which version of the plugin API it needs."""
@@ -150,7 +162,7 @@ SIMPLE_KINDS: dict[str, Kind] = {
 }
 """Kinds of classes that come in the same way, have no settings, and no contract in cfx-contracts.
 
-`add_kind` adds those of other distributions.
+Other distributions have more of them, by an entry point of the group `cfx.kinds` each.
 """
 
 GROUPS: dict[str, Kind] = {kind.group: kind for kind in KINDS.values() if kind.chosen}
@@ -204,20 +216,22 @@ _tried: set[tuple[Entry, str]] = set()
 """Components that were tried, with their settings as JSON."""
 
 
-def add_kind(kind: Kind) -> None:
-    """Adds a kind of a distribution of its own, whose classes come in by `kind.entry_points`.
-
-    Raises:
-        PluginError: there is another kind of that name.
-    """
-    if every_kind().get(kind.name, kind) != kind:
-        raise PluginError(f"there is a kind '{kind.name}' already; choose another name")
-    SIMPLE_KINDS[kind.name] = kind
-
-
 def every_kind() -> dict[str, Kind]:
-    """Returns all kinds by name: components first, then what comes in the same way."""
-    return {**KINDS, **SIMPLE_KINDS}
+    """Returns all kinds by name: components first, then what comes in the same way.
+
+    Those of other distributions come last. Imports nothing.
+    """
+    return {**KINDS, **SIMPLE_KINDS, **_kinds_of_plugins(_search_path())}
+
+
+@functools.lru_cache(maxsize=1)
+def _kinds_of_plugins(search_path: tuple[tuple[str, float], ...]) -> dict[str, Kind]:
+    """Returns the kinds that other distributions announce: an entry point is a base class each."""
+    kinds = {}
+    for announced in _announced(search_path).get(KINDS_GROUP, ()):
+        if announced.name not in KINDS and announced.name not in SIMPLE_KINDS:
+            kinds[announced.name] = Kind(announced.name, announced.target, chosen=False)
+    return kinds
 
 
 def kind_of(kind: str) -> Kind:
@@ -244,8 +258,11 @@ def entries(kind: str) -> tuple[Entry, ...]:
         PluginError: there is no such kind.
     """
     announced = _of_kind(kind_of(kind))
-    added = [one for one in _of_this_process.values() if one.kind == kind_of(kind).name]
-    return _sorted([*announced, *added])
+    every = list(announced)
+    for added in _of_this_process.values():
+        if added.kind == kind_of(kind).name:
+            every.append(added)
+    return _sorted(every)
 
 
 def names(kind: str) -> tuple[str, ...]:
@@ -262,9 +279,8 @@ def entry(kind: str, name: str) -> Entry:
     """
     about = kind_of(kind)
     call, what = about.call(name), about.name
-    every = [one for one in entries(kind) if one.name == name]
-    found = [one for one in every if one.distribution == OWN] or every
-    if not found:
+    claims = _that_count(_of_name(kind, name))
+    if not claims:
         known = names(kind)
         if not known and about.name in KINDS:
             raise PluginError(
@@ -272,12 +288,32 @@ def entry(kind: str, name: str) -> Entry:
                 " run make run, or pip install -e ."
             )
         raise PluginError(f"{call}: there is no {what} '{name}'.{advice(about.group, name, known)}")
-    if len(found) > 1:
-        claims = " and ".join(f"{one.distribution} {one.version} ({one.target})" for one in found)
+    if len(claims) > 1:
+        texts = []
+        for claim in claims:
+            texts.append(f"{claim.distribution} {claim.version} ({claim.target})")
         raise PluginError(
-            f"{call}: two distributions bring a {what} '{name}': {claims}; uninstall one of them"
+            f"{call}: two distributions bring a {what} '{name}': {' and '.join(texts)};"
+            " uninstall one of them"
         )
-    return found[0]
+    return claims[0]
+
+
+def _of_name(kind: str, name: str) -> list[Entry]:
+    """Returns the entries of a name, of whatever distribution."""
+    same_name = []
+    for announced in entries(kind):
+        if announced.name == name:
+            same_name.append(announced)
+    return same_name
+
+
+def _that_count(claims: list[Entry]) -> list[Entry]:
+    """Returns cfx's own of some entries of one name, which no other replaces; without it, all."""
+    for claim in claims:
+        if claim.distribution == OWN:
+            return [claim]
+    return claims
 
 
 def get(kind: str, name: str) -> type[Component]:
@@ -287,15 +323,15 @@ def get(kind: str, name: str) -> type[Component]:
         PluginError: the name is unknown or claimed twice; or the component was built for another
             version of the plugin API, cannot be imported, or breaks the contract of its kind.
     """
-    found = entry(kind, name)
-    if found not in _loaded:
-        complaint = other_api(found)
+    announced = entry(kind, name)
+    if announced not in _loaded:
+        complaint = other_api(announced)
         if complaint:
             raise PluginError(complaint)
-        cls = _import(found)
-        _check(found, cls)
-        _loaded[found] = cls
-    return _loaded[found]
+        cls = _import(announced)
+        _check(announced, cls)
+        _loaded[announced] = cls
+    return _loaded[announced]
 
 
 def add(kind: str, name: str, cls: type[Component]) -> None:
@@ -314,14 +350,14 @@ def add(kind: str, name: str, cls: type[Component]) -> None:
                 f"{other} is installed, and {about.call(name)} means it; choose another name"
             )
     target = f"{cls.__module__}:{cls.__qualname__}"
-    found = Entry(about.name, name, target, THIS_PROCESS, str(next(_additions)), "")
-    _check(found, cls)
+    announced = Entry(about.name, name, target, THIS_PROCESS, str(next(_additions)), "")
+    _check(announced, cls)
     cls.process_code = uuid.uuid4().hex
     before = _of_this_process.pop((about.name, name), None)
     if before is not None:
         _loaded.pop(before, None)
-    _of_this_process[about.name, name] = found
-    _loaded[found] = cls
+    _of_this_process[about.name, name] = announced
+    _loaded[announced] = cls
 
 
 def create(kind: str, node: Mapping[str, Any]) -> Component:
@@ -343,19 +379,20 @@ def create(kind: str, node: Mapping[str, Any]) -> Component:
         raise ConfigError(
             f"{group}.name: a value is required; choose a {kind}: {', '.join(names(kind))}"
         )
-    cls, found = get(kind, name), entry(kind, name)
-    values = {key: value for key, value in node.items() if key != "name"}
+    cls, announced = get(kind, name), entry(kind, name)
+    values = dict(node)
+    del values["name"]
     settings = validate(cls.schema, _without_blanks(cls.schema, values), where=group)
-    _warn_of_deprecated(found, cls, settings)
+    _warn_of_deprecated(announced, cls, settings)
     try:
         component = cls(settings)
     except CfxError:
         raise
     except Exception as error:
         raise PluginError(
-            f"{found} cannot be created: {in_words(error)}{_remedy(found)}"
+            f"{announced} cannot be created: {in_words(error)}{_remedy(announced)}"
         ) from error
-    _try(found, component, settings)
+    _try(announced, component, settings)
     return component
 
 
@@ -402,25 +439,52 @@ def installed(kind: str) -> tuple[Installed[Any], ...]:
     return _installed(kind, _search_path())
 
 
+def chosen(
+    kind: str, named: str | Iterable[str], distributions: Collection[str]
+) -> tuple[Installed[Any], ...]:
+    """Returns those of a kind that a job names, such as its tables and figures, in their order.
+
+    Args:
+        kind: whose components need no settings.
+        named: `own`: cfx's own, and those of the job's distributions; `all`: all that are
+            installed; `none`; or names, in which `own` may stand.
+        distributions: that bring the job's components.
+
+    Raises:
+        PluginError: there is none of a name.
+    """
+    if named == "all":
+        return installed(kind)
+    names = {named} if isinstance(named, str) else set(named)
+    for name in names - {ALL_OWN, "none"}:
+        get(kind, name)
+    components = []
+    for component in installed(kind):
+        is_own = component.distribution == OWN or component.distribution in distributions
+        if component.name in names or (ALL_OWN in names and is_own):
+            components.append(component)
+    return tuple(components)
+
+
 @functools.lru_cache(maxsize=8)
 def _installed(
     kind: str,
     search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - part of the cache's key
 ) -> tuple[Installed[Any], ...]:
     made = []
-    for found in entries(kind):
-        others = rivals(found)
+    for announced in entries(kind):
+        others = rivals(announced)
         if others:
-            _warn_of_left_out(found, f"{others[0].distribution} brings one of that name")
+            _warn_of_left_out(announced, f"{others[0].distribution} brings one of that name")
             continue
         try:
-            component: Any = create(kind, {"name": found.name})
+            component: Any = create(kind, {"name": announced.name})
         except PluginError as error:
-            if found.distribution == OWN:
+            if announced.distribution == OWN:
                 raise
-            _warn_of_left_out(found, str(error))
+            _warn_of_left_out(announced, str(error))
             continue
-        made.append(Installed(kind, found.name, component, found.distribution))
+        made.append(Installed(kind, announced.name, component, announced.distribution))
     return tuple(sorted(made, key=lambda one: (one.component.order, one.name)))
 
 
@@ -430,49 +494,58 @@ def _warn_of_left_out(one: Entry | Installed[Any], reason: str) -> None:
     )
 
 
-def is_loaded(found: Entry) -> bool:
+def is_loaded(announced: Entry) -> bool:
     """Says whether the component was imported and passed its checks."""
-    return found in _loaded
+    return announced in _loaded
 
 
-def rivals(found: Entry) -> tuple[Entry, ...]:
+def rivals(announced: Entry) -> tuple[Entry, ...]:
     """Returns the entries of other distributions that keep this one from being used.
 
     It is empty for most. Imports nothing.
     """
-    if found.distribution == OWN:
+    if announced.distribution == OWN:
         return ()
-    others = [one for one in entries(found.kind) if one.name == found.name and one != found]
-    return tuple([one for one in others if one.distribution == OWN] or others)
+    others = []
+    for other in _of_name(announced.kind, announced.name):
+        if other != announced:
+            others.append(other)
+    return tuple(_that_count(others))
 
 
-def other_api(found: Entry) -> str:
+def other_api(announced: Entry) -> str:
     """Returns a sentence if the distribution was built for other versions of the plugin API only.
 
     Returns "" if it was not. Imports nothing.
     """
-    if found.distribution == OWN or not found.api or str(API_VERSION) in found.api:
+    if announced.distribution == OWN or not announced.api or str(API_VERSION) in announced.api:
         return ""
-    versions = [int(one) for one in found.api if one.isdecimal()]
+    versions = []
+    for declared in announced.api:
+        if declared.isdecimal():
+            versions.append(int(declared))
     if not versions:
         return (
-            f"{found} declares '{found.api[0]}' as its version of cfx's plugin API, which is no"
-            f" number; its author must name the entry point of the group {API_GROUP} by one,"
+            f"{announced} declares '{announced.api[0]}' as its version of cfx's plugin API, which"
+            f" is no number; its author must name the entry point of the group {API_GROUP} by one,"
             f" such as {API_VERSION}"
         )
-    outdated = found.distribution
+    outdated = announced.distribution
     if min(versions) > API_VERSION:
         outdated = OWN
     return (
-        f"{found} was built for version {' and '.join(found.api)} of cfx's plugin API, this cfx has"
-        f" version {API_VERSION}; pip install --upgrade {outdated}, or pip uninstall"
-        f" {found.distribution}"
+        f"{announced} was built for version {' and '.join(announced.api)} of cfx's plugin API, this"
+        f" cfx has version {API_VERSION}; pip install --upgrade {outdated}, or pip uninstall"
+        f" {announced.distribution}"
     )
 
 
 def _entry_of(cls: type) -> Entry | None:
     """Returns what announced a class; None if no distribution did."""
-    return next((found for found, loaded in _loaded.items() if loaded is cls), None)
+    for announced, loaded in _loaded.items():
+        if loaded is cls:
+            return announced
+    return None
 
 
 def origin(component: Component | type[Component]) -> str:
@@ -486,17 +559,17 @@ def origin(component: Component | type[Component]) -> str:
 
 def is_own(component: Component) -> bool:
     """Says whether a component is one of cfx's own."""
-    found = _entry_of(type(component))
-    return found is not None and found.distribution == OWN
+    announced = _entry_of(type(component))
+    return announced is not None and announced.distribution == OWN
 
 
 def name_of(component: Component) -> str:
     """Returns the name under which configs choose a component; its class's if it is none's."""
-    found = _entry_of(type(component))
-    return type(component).__name__ if found is None else found.name
+    announced = _entry_of(type(component))
+    return type(component).__name__ if announced is None else announced.name
 
 
-def _try(found: Entry, component: Component, settings: BaseModel) -> None:
+def _try(announced: Entry, component: Component, settings: BaseModel) -> None:
     """Holds a component to the first statements of its contract, once for each of its settings.
 
     Statements are assertions: python -O leaves this out.
@@ -504,37 +577,37 @@ def _try(found: Entry, component: Component, settings: BaseModel) -> None:
     Raises:
         PluginError: it breaks its contract; names the distribution.
     """
-    first = kind_of(found.kind).first
+    first = kind_of(announced.kind).first
     if not first or not __debug__:
         return
-    key = (found, settings.model_dump_json())
+    key = (announced, settings.model_dump_json())
     if key in _tried:
         return
     for _, sentence in violations(component, _resolve(first)):
-        raise PluginError(f"{found} breaks its contract: {sentence}{_remedy(found)}")
+        raise PluginError(f"{announced} breaks its contract: {sentence}{_remedy(announced)}")
     _tried.add(key)
 
 
-def _remedy(found: Entry) -> str:
-    if found.distribution == THIS_PROCESS:
+def _remedy(announced: Entry) -> str:
+    if announced.distribution == THIS_PROCESS:
         return "; repair it"
     return (
-        f"; repair that distribution (cfx plugins check {found.kind} {found.name}),"
-        f" or pip uninstall {found.distribution}"
+        f"; repair that distribution (cfx plugins check {announced.kind} {announced.name}),"
+        f" or pip uninstall {announced.distribution}"
     )
 
 
-def _warn_of_deprecated(found: Entry, cls: type[Component], settings: BaseModel) -> None:
+def _warn_of_deprecated(announced: Entry, cls: type[Component], settings: BaseModel) -> None:
     """Logs a warning for a deprecated component, and for each deprecated setting that is set."""
     if cls.deprecated:
-        log.warning("%s is deprecated: %s", found, cls.deprecated)
+        log.warning("%s is deprecated: %s", announced, cls.deprecated)
     for name, field in cls.schema.model_fields.items():
         if not field.deprecated:
             continue
         default = field.get_default(call_default_factory=True, validated_data={})
         if settings.__dict__[name] != default:  # getattr would raise pydantic's own warning
-            path = f"{kind_of(found.kind).group}.{name}"
-            log.warning("%s of %s is deprecated: %s", path, found, field.deprecation_message)
+            path = f"{kind_of(announced.kind).group}.{name}"
+            log.warning("%s of %s is deprecated: %s", path, announced, field.deprecation_message)
 
 
 def _search_path() -> tuple[tuple[str, float], ...]:
@@ -552,8 +625,8 @@ def _search_path() -> tuple[tuple[str, float], ...]:
     return tuple(stamps)
 
 
-def _sorted(found: Iterable[Entry]) -> tuple[Entry, ...]:
-    return tuple(sorted(found, key=attrgetter("name", "distribution")))
+def _sorted(announced: Iterable[Entry]) -> tuple[Entry, ...]:
+    return tuple(sorted(announced, key=attrgetter("name", "distribution")))
 
 
 def _of_kind(kind: Kind) -> tuple[Entry, ...]:
@@ -577,17 +650,25 @@ def _announced(
             seen.add(announced[0][1].distribution)
             for group, one in announced:
                 found.setdefault(group, []).append(one)
-    return {group: _sorted(ones) for group, ones in found.items()}
+    by_group = {}
+    for group, announced_there in found.items():
+        by_group[group] = _sorted(announced_there)
+    return by_group
 
 
 def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[str, Entry]]:
     """Yields what one distribution announces, each with its entry-point group."""
-    kinds = {kind.entry_points: kind.name for kind in every_kind().values()}
-    points = [point for point in distribution.entry_points if point.group.startswith("cfx.")]
-    api = tuple(sorted(point.name for point in points if point.group == API_GROUP))
-    ours = [point for point in points if point.group != API_GROUP]
+    api, ours = [], []
+    for point in distribution.entry_points:
+        if point.group == API_GROUP:
+            api.append(point.name)
+        elif point.group.startswith("cfx."):
+            ours.append(point)
     if not ours:
         return
+    kinds = {}
+    for about in (*KINDS.values(), *SIMPLE_KINDS.values()):
+        kinds[about.entry_points] = about.name
     metadata = distribution.metadata  # read anew each time that it is asked for
     name, version = metadata["Name"], metadata["Version"]
     if not isinstance(name, str) or not isinstance(version, str):
@@ -596,12 +677,16 @@ def _entries(distribution: importlib.metadata.Distribution) -> Iterator[tuple[st
     location = str(distribution.locate_file(""))
     for point in ours:
         kind = kinds.get(point.group, point.group.removeprefix("cfx.").removesuffix("s"))
-        one = Entry(kind, point.name, point.value, name, version, location, summary, api)
-        yield point.group, one
+        yield (
+            point.group,
+            Entry(
+                kind, point.name, point.value, name, version, location, summary, tuple(sorted(api))
+            ),
+        )
 
 
-def _import(found: Entry) -> Any:
-    module, _, attribute = found.target.partition(":")
+def _import(announced: Entry) -> Any:
+    module, _, attribute = announced.target.partition(":")
     try:
         with same_environment():  # libraries set variables as they are imported
             imported = importlib.import_module(module)
@@ -610,48 +695,48 @@ def _import(found: Entry) -> Any:
         raise
     except BaseException as error:  # a plugin may raise anything, even SystemExit
         raise PluginError(
-            f"{found} cannot be imported: {in_words(error)};"
-            f" repair that distribution, or pip uninstall {found.distribution}"
+            f"{announced} cannot be imported: {in_words(error)};"
+            f" repair that distribution, or pip uninstall {announced.distribution}"
         ) from error
 
 
-def _check(found: Entry, cls: Any) -> None:
+def _check(announced: Entry, cls: Any) -> None:
     """Raises PluginError unless `cls` keeps the contract of its kind."""
-    base = _resolve(kind_of(found.kind).base)
+    base = _resolve(kind_of(announced.kind).base)
     if not inspect.isclass(cls):
         raise PluginError(
-            f"{found} is no class but {type(cls).__name__};"
+            f"{announced} is no class but {type(cls).__name__};"
             f" point its entry point at a subclass of {base.__name__}"
         )
     if not issubclass(cls, base):
-        raise PluginError(f"{found} does not extend {base.__module__}.{base.__name__}")
+        raise PluginError(f"{announced} does not extend {base.__module__}.{base.__name__}")
     missing = sorted(getattr(cls, "__abstractmethods__", ()))
     if missing:
-        raise PluginError(f"{found} does not implement {', '.join(missing)}")
+        raise PluginError(f"{announced} does not implement {', '.join(missing)}")
     if not issubclass(cls, Component):
         return
     if cls.kind != base.kind:
         raise PluginError(
-            f"{found} says kind='{cls.kind}',"
-            f" but a {found.kind} keeps kind='{base.kind}' of its base class"
+            f"{announced} says kind='{cls.kind}',"
+            f" but a {announced.kind} keeps kind='{base.kind}' of its base class"
         )
     schema = cls.schema
     if not (inspect.isclass(schema) and issubclass(schema, Settings)):
         raise PluginError(
-            f"{found}: its schema must be a subclass of cfx.plugin.Settings, not {schema!r}"
+            f"{announced}: its schema must be a subclass of cfx.plugin.Settings, not {schema!r}"
         )
     if "name" in schema.model_fields:
         raise PluginError(
-            f"{found}: its settings must not have a field 'name',"
+            f"{announced}: its settings must not have a field 'name',"
             " which chooses the component itself"
         )
-    if found.kind in {"model", "simulator"} and not issubclass(schema, base.schema):
+    if announced.kind in {"model", "simulator"} and not issubclass(schema, base.schema):
         raise PluginError(
-            f"{found}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
+            f"{announced}: its schema must extend {base.schema.__module__}.{base.schema.__name__}"
         )
     complaint = cls.complaint()
     if complaint:
-        raise PluginError(f"{found}{complaint}")
+        raise PluginError(f"{announced}{complaint}")
 
 
 def _resolve(target: str) -> Any:
@@ -703,25 +788,25 @@ def blame(
         file = Path(frame.filename).resolve()
         if file.is_relative_to(_PACKAGE):
             return None
-        for package, found in packages.items():
+        for package, announced in packages.items():
             if file.is_relative_to(package):
                 where = f"{file.relative_to(package.parent)}, line {frame.lineno}"
                 return PluginError(
-                    f"{found} failed in {where}: {failure}; {more};"
-                    f" repair that distribution, or pip uninstall {found.distribution}"
+                    f"{announced} failed in {where}: {failure}; {more};"
+                    f" repair that distribution, or pip uninstall {announced.distribution}"
                 )
     return None
 
 
 def _packages() -> dict[Path, Entry]:
     """Returns the places of plugins' code: a package's folder, or a single module's file."""
-    found: dict[Path, Entry] = {}
+    by_place: dict[Path, Entry] = {}
     for kind in every_kind():
-        for one in entries(kind):
-            if one.distribution not in {OWN, THIS_PROCESS}:
-                for place in _places(one.package):
-                    found.setdefault(place, one)
-    return found
+        for announced in entries(kind):
+            if announced.distribution not in {OWN, THIS_PROCESS}:
+                for place in _places(announced.package):
+                    by_place.setdefault(place, announced)
+    return by_place
 
 
 def _places(module: str) -> list[Path]:
@@ -732,5 +817,5 @@ def _places(module: str) -> list[Path]:
         spec = None
     if spec is None:
         return []
-    places = [*(spec.submodule_search_locations or ()), spec.origin]
-    return [Path(place).resolve() for place in places[:1] if place is not None]
+    first = next(iter(spec.submodule_search_locations or ()), spec.origin)
+    return [] if first is None else [Path(first).resolve()]

@@ -20,6 +20,13 @@ from cfx.core.distributions import install_line
 from cfx.core.files import atomic_write
 from cfx.errors import CfxError, DataError, NotInstalledError, first_line, without_passwords
 
+__all__ = [
+    "is_url",
+    "local_folder",
+]
+"""What plugins may use, as `cfx.plugin.storage`."""
+
+
 _PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}
 """Packages that fsspec needs for kinds of URLs."""
 
@@ -45,12 +52,15 @@ def local_copies(url: str) -> list[Path]:
     """
     with _explained(f"data.path={url}"):
         system, path = _opened(url)
-        found = [path]
-        if any(mark in path for mark in "*?["):
-            found = sorted(system.glob(path))
-        if not found:
+        paths = [path]
+        if not set("*?[").isdisjoint(path):
+            paths = sorted(system.glob(path))
+        if not paths:
             raise DataError(f"data.path={url}: no file matches this pattern")
-        return [_copy(system, one) for one in found]
+        copies = []
+        for file in paths:
+            copies.append(_copy(system, file))
+        return copies
 
 
 def local_folder(url: str) -> Path:

@@ -14,6 +14,15 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from typing import TypeVar
 
+__all__ = [
+    "cores",
+    "limit_cores",
+    "one_thread",
+    "own_cores",
+]
+"""What plugins may use, as `cfx.plugin.threads`."""
+
+
 log = logging.getLogger(__name__)
 
 _Item = TypeVar("_Item")

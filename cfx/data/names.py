@@ -15,6 +15,14 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import BeforeValidator
 
+__all__ = [
+    "name_of",
+    "named_twice",
+    "names_of",
+]
+"""What plugins may use, as `cfx.plugin.names`."""
+
+
 _WHOLE_NUMBER = re.compile(r"-?\d+\.0*")
 """A whole number that is written with a decimal point."""
 

@@ -18,6 +18,13 @@ import numpy as np
 from cfx.data.files import Floats
 from cfx.data.pairs import Remark
 
+__all__ = [
+    "Statement",
+    "remarks_of",
+]
+"""What plugins may use, as `cfx.plugin.statements`."""
+
+
 _ROOM = 0.08
 """How far the logarithm of what is said may be from that of what follows."""
 

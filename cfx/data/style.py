@@ -31,6 +31,17 @@ from cfx.errors import DataError
 if TYPE_CHECKING:
     import pandas as pd
 
+__all__ = [
+    "ALL_TYPES",
+    "CLUSTERS",
+    "INDICATORS",
+    "Group",
+    "groups",
+    "name_of_indicator",
+]
+"""What plugins may use, as `cfx.plugin.style`."""
+
+
 Floats = NDArray[np.float64]
 
 

@@ -14,6 +14,25 @@ from cfx.data.files import Floats, Ints
 from cfx.data.pairs import Dropped, Pair, PairSet, Remark
 from cfx.errors import listed
 
+__all__ = [
+    "NOBODY",
+    "SINGLE_FRAME",
+    "Marks",
+    "accelerations",
+    "changes",
+    "count_reasons",
+    "distance_driven",
+    "first_that_holds",
+    "next_in_lane",
+    "rows_ahead",
+    "runs",
+    "totals_by_reason",
+    "unique_name",
+    "vehicles_apart",
+]
+"""What plugins may use, as `cfx.plugin.tracks`."""
+
+
 Marks = NDArray[np.bool_]
 """Says of each row whether something holds, `(N,)`."""
 

@@ -27,6 +27,17 @@ from cfx.policies.context import DriverContext
 from cfx.policies.history import measured_history
 from cfx.simulation.base import Stepper
 
+__all__ = [
+    "LeaderFuture",
+    "Origins",
+    "Paths",
+    "extrapolated",
+    "measured_paths",
+    "sample_from_origins",
+]
+"""What plugins may use, as `cfx.plugin.forecasts`."""
+
+
 LeaderFuture = Literal["given", "constant_speed", "constant_acceleration"]
 """What is known of the leader after an origin.
 

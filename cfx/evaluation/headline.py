@@ -8,6 +8,12 @@ from typing import NamedTuple
 
 from cfx.evaluation.metrics.base import key_of
 
+__all__ = [
+    "summaries_disagree",
+]
+"""What plugins may use, as `cfx.plugin.headline`."""
+
+
 RESULT = "result"
 """The tag that says it in words."""
 

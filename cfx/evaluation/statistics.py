@@ -25,6 +25,16 @@ from cfx.evaluation.headline import lower_by, summaries_disagree
 if TYPE_CHECKING:
     import pandas as pd
 
+__all__ = [
+    "Against",
+    "improvement_statistics",
+    "mean_interval",
+    "ranking_of",
+    "verdict",
+]
+"""What plugins may use, as `cfx.plugin.statistics`."""
+
+
 _TRIMMED = 0.1
 """Share dropped at each end of the ratios for the trimmed mean, as in the paper."""
 

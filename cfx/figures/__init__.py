@@ -1,4 +1,4 @@
-"""How figures look: `canvas.py` has fonts and paper, `text.py` the names of methods and units.
+"""How figures look: `canvas.py` has fonts and paper, `colours.py` and `wording.py` what they say.
 
 `drawing.py` finds the figures that are installed, draws them in this look and writes them.
 """

@@ -22,7 +22,39 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
-from cfx.figures.text import EDGE, INK, PALE, colour_of, method_label, percent
+from cfx.figures.colours import EDGE, INK, PALE, colour_of
+from cfx.figures.wording import method_label, percent
+
+__all__ = [
+    "DASHES",
+    "HIDDEN",
+    "WIDTH",
+    "Array",
+    "Line",
+    "Paper",
+    "blank",
+    "draw_lines",
+    "draw_points",
+    "figure_style",
+    "finite",
+    "hover",
+    "hover_text",
+    "legend_above",
+    "logarithmic",
+    "mark_points",
+    "method_legend",
+    "most_across",
+    "on_paper",
+    "percent_axis",
+    "percent_tick",
+    "points",
+    "side_by_side",
+    "styled",
+    "vehicle_colour",
+    "wrapped",
+]
+"""What plugins may use, as `cfx.plugin.canvas`."""
+
 
 Array = NDArray[np.float64]
 """Values that a figure shows, of any shape."""
@@ -246,7 +278,7 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     return drawn
 
 
-def canvas(height: float, width: float = WIDTH) -> Figure:
+def blank(height: float, width: float = WIDTH) -> Figure:
     """Returns an empty figure that belongs to no pyplot state and no window.
 
     Height and width are inches on the usual paper; on another they follow the text.

@@ -7,27 +7,28 @@ from __future__ import annotations
 
 import html
 import io
-import logging
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 
 from cfx.core import registry
-from cfx.core.distributions import install_line
+from cfx.core.distributions import advice
 from cfx.core.files import atomic_write
-from cfx.errors import DataError, OutputError, listed, nearest
+from cfx.errors import DataError, OutputError
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-log = logging.getLogger(__name__)
-
-
-def where_figures_are() -> str:
-    """Returns how figures of jobs are installed."""
-    return f"Figures of jobs come with cfx-report: {install_line('cfx-report')}"
+__all__ = [
+    "FIGURE_METADATA",
+    "draw_figure",
+    "figure_named",
+    "write_figure",
+    "write_figures",
+]
+"""What plugins may use, as `cfx.plugin.drawing`."""
 
 
 def figure_named(name: str) -> registry.Installed[Any]:
@@ -39,11 +40,7 @@ def figure_named(name: str) -> registry.Installed[Any]:
     figures = {figure.name: figure for figure in registry.installed("figure")}
     if name in figures:
         return figures[name]
-    if not figures:
-        raise DataError(f"there is no figure '{name}'. {where_figures_are()}")
-    raise DataError(
-        f"there is no figure '{name}'.{nearest(name, figures)} Known: {listed(list(figures))}."
-    )
+    raise DataError(f"there is no figure '{name}'.{advice('figure', name, list(figures))}")
 
 
 def draw_figure(figure: registry.Installed[Any], result: Any) -> Figure | None:
@@ -74,38 +71,41 @@ FIGURE_METADATA: dict[str, dict[str, None]] = {
 def write_figures(
     folder: Path,
     result: Any,
+    figures: Iterable[registry.Installed[Any]] | None = None,
     *,
     formats: Sequence[str] = ("png",),
-    names: Sequence[str] | None = None,
 ) -> list[Path]:
-    """Draws and writes all figures that a result allows; returns their paths.
-
-    Of all figures those are deleted that an earlier job has left in the folder.
+    """Draws and writes figures, those that a result allows; returns their paths.
 
     Args:
         folder: made if it is not there.
         result: a `cfx.results.result.Result`.
+        figures: to be drawn; None: all that are installed.
         formats: files of each figure: `png`, `pdf`, `svg`.
-        names: of the figures; None: all.
 
     Raises:
         OutputError: a file cannot be written.
     """
-    figures = registry.installed("figure")
-    if not figures:
-        log.warning("No figures are drawn. %s", where_figures_are())
     paths = []
-    for figure in figures:
-        if names is not None and figure.name not in names:
-            continue
+    for figure in registry.installed("figure") if figures is None else figures:
         drawing = draw_figure(figure, result)
-        for form in ("png", "pdf", "svg"):
-            path = folder / f"{figure.name}.{form}"
-            if drawing is not None and form in formats:
-                paths.append(write_figure(drawing, path))
-            elif names is None:
-                path.unlink(missing_ok=True)  # of an earlier job in the same folder
+        if drawing is None:
+            continue
+        for form in FIGURE_METADATA:
+            if form in formats:
+                paths.append(write_figure(drawing, folder / f"{figure.name}.{form}"))
     return paths
+
+
+def remove_figures(folder: Path) -> None:
+    """Removes the figures that an earlier job has left in a folder; other files stay.
+
+    Raises:
+        OSError: a file cannot be removed.
+    """
+    for figure in registry.installed("figure"):
+        for form in FIGURE_METADATA:
+            (folder / f"{figure.name}.{form}").unlink(missing_ok=True)
 
 
 def write_figure(figure: Figure, path: Path) -> Path:

@@ -48,6 +48,14 @@ from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
 from cfx.models.regimes import Temperature, safe_sqrt
 
+__all__ = [
+    "COMFORTABLE_BRAKING",
+    "RELAXATION_TIME",
+    "SPEED_LIMIT",
+    "WithSpeedLimit",
+]
+"""What plugins may use, as `cfx.plugin.composed`."""
+
 
 class Composed(DrivingModel):
     """Base of driving models that have another one inside.

@@ -17,6 +17,18 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+__all__ = [
+    "SPACING_WIDTH",
+    "SPEED_WIDTH",
+    "safe_divisor",
+    "safe_sqrt",
+    "switches_exactly",
+    "where_below",
+    "where_up_to",
+]
+"""What plugins may use, as `cfx.plugin.regimes`."""
+
+
 Temperature = float | Tensor
 """Width of the smooth switch between regimes, in multiples of the scales below; 0 is exact.
 

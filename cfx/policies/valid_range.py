@@ -25,6 +25,14 @@ from cfx.data.pairs import PairBatch
 from cfx.data.signals import SIGNALS
 from cfx.policies.history import History, changed
 
+__all__ = [
+    "FADED",
+    "RANGE_SIGNALS",
+    "share_in_words",
+]
+"""What plugins may use, as `cfx.plugin.valid_range`."""
+
+
 FADED = 2.5
 """Score from which on nothing is left of an agent's answer. Nearer bounds are worse: mixtures of an
 answer and the base can be worse than either, and just outside the answers are still good."""

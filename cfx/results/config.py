@@ -100,21 +100,12 @@ class TrackingSettings(Settings):
     )
 
 
-class FigureSettings(Settings):
-    """What is drawn."""
-
-    enabled: bool = Field(True, description="write figures")
-    formats: Distinct[tuple[Literal["png", "pdf", "svg"], ...]] = Field(
-        ("png",), min_length=1, description="files of each figure; pdf and svg for a paper"
-    )
-
-
 _CONSTANT = ("fixed", "default")
 """Policies of cfx that keep parameters constant: such a job is a calibration."""
 
 
 Chosen = Literal["own", "all"] | tuple[str, ...]
-"""Which metrics, or tables, of those that are installed."""
+"""Which metrics, tables or figures of those that are installed."""
 
 
 class JobNodes(Settings):
@@ -141,6 +132,18 @@ class JobNodes(Settings):
         " components the job has; all: all that are installed; or a list of names, in which own may"
         " stand",
     )
+
+    figures: Literal["none"] | Chosen = Field(
+        "own",
+        description="which figures are drawn: own: cfx's own, and those of the plugins whose"
+        " components the job has; all: all that are installed; none; or a list of names, in which"
+        " own may stand",
+    )
+
+    @field_validator("figures", mode="before")
+    @classmethod
+    def _figures(cls, chosen: Any) -> Any:
+        return chosen if chosen == "none" else cls._several(chosen)
 
     @field_validator("metrics", "tables", mode="before")
     @classmethod
@@ -179,7 +182,9 @@ class JobRecords(Settings):
 
     output: OutputSettings = Field(OutputSettings(), description="where results go")
     tracking: TrackingSettings = Field(TrackingSettings(), description="where jobs are tracked")
-    figures: FigureSettings = Field(FigureSettings(), description="figures")
+    figure_formats: Distinct[tuple[Literal["png", "pdf", "svg"], ...]] = Field(
+        ("png",), min_length=1, description="files of each figure; pdf and svg for a paper"
+    )
     failed_value: Annotated[float, Field(ge=float("-inf"), allow_inf_nan=True)] | None = Field(
         None,
         description="what a sweeper that optimises is told if this job fails, such as inf; null:"

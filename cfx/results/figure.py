@@ -38,7 +38,7 @@ class JobFigure(Component):
 
     @abstractmethod
     def draw(self, result: Result) -> Figure | None:
-        """Draws it, with `cfx.figures.canvas.canvas` as its paper.
+        """Draws it, with `cfx.figures.canvas.blank` as its paper.
 
         It is called in the common look. A figure belongs to no window (`pyplot` is not used) and
         the same result gives the same figure.

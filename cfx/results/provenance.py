@@ -84,21 +84,22 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
 
 
 def named_distributions(values: Mapping[str, Any]) -> dict[str, str]:
-    """Returns the plugin distributions of a configuration's metrics and tables with versions.
+    """Returns the plugin distributions of a configuration's metrics, tables and figures.
 
     Raises:
-        PluginError: there is no metric, or no table, of that name.
+        PluginError: there is no metric, table or figure of that name.
     """
     from cfx.core import registry
     from cfx.core.distributions import ALL_OWN, OWN
     from cfx.evaluation.metrics.base import entries_of
 
     entries = list(entries_of(values.get("metrics", ALL_OWN)))
-    tables = values.get("tables", ALL_OWN)
-    if tables == "all":
-        entries += registry.entries("table")
-    elif not isinstance(tables, str):
-        entries += [registry.entry("table", name) for name in tables if name != ALL_OWN]
+    for kind in ("table", "figure"):
+        named = values.get(f"{kind}s", ALL_OWN)
+        if named == "all":
+            entries += registry.entries(kind)
+        elif not isinstance(named, str):
+            entries += [registry.entry(kind, name) for name in named if name != ALL_OWN]
     return {one.distribution: one.version for one in entries if one.distribution != OWN}
 
 

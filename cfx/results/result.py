@@ -6,6 +6,7 @@ A metric of a plugin that is not installed here is known from `data.json` alone.
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
@@ -30,12 +31,12 @@ from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo, column_of, key_of
 from cfx.evaluation.result import METHODS, Evaluation, PairTrajectory, Purpose
 from cfx.evaluation.statistics import STATISTICS, Improvement
 from cfx.evaluation.tables import scope_label
-from cfx.figures.drawing import as_html, drawn, write_figures
+from cfx.figures.drawing import as_html, drawn, remove_figures, write_figures
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.folder import DATA, METRICS, begin, write_config, writing
 from cfx.results.provenance import distributions
-from cfx.results.table import ResultTable, chosen_tables, tables_of
+from cfx.results.table import ResultTable, tables_of
 from cfx.simulation.trajectory import TRANSIENT_S
 
 if TYPE_CHECKING:
@@ -44,6 +45,8 @@ if TYPE_CHECKING:
     from cfx.core.parameters import Parameter
     from cfx.evaluation.demo import Demo
     from cfx.policies.agent import Agent
+
+log = logging.getLogger(__name__)
 
 OUTSIDE = "outside_range"
 """A metric that says nothing of constant parameters."""
@@ -496,9 +499,7 @@ class Result:
             if tell is not None:
                 tell(result)
             checkpoint.save_agent(self.policy, folder / "policy")
-            figures: list[Path] = []
-            if config.figures.enabled:
-                figures = write_figures(folder / "figures", result, formats=config.figures.formats)
+            figures = _write_figures(folder / "figures", result, config)
             result = replace(result, figures=tuple(figures), demo=self._write_demo(folder, config))
             write_json(folder / DATA, dict(result.data))
             written: dict[str, float | None] = {}
@@ -543,7 +544,7 @@ class Result:
 
 def _chosen_by(config: JobConfig) -> tuple[registry.Installed[ResultTable], ...]:
     """Returns the tables that a configuration asks for."""
-    return chosen_tables(config.tables, distributions(config.model_dump()))
+    return registry.chosen("table", config.tables, distributions(config.model_dump()))
 
 
 def described_parameters(parameters: Iterable[Parameter]) -> list[dict[str, Any]]:
@@ -628,3 +629,18 @@ def _trajectory(
         gap=gap,
         parameters=parameters,
     )
+
+
+def _write_figures(folder: Path, result: Result, config: JobConfig) -> list[Path]:
+    """Draws the figures that a configuration names, and says which others are installed."""
+    remove_figures(folder)
+    figures = registry.chosen("figure", config.figures, distributions(config.model_dump()))
+    paths = write_figures(folder, result, figures, formats=config.figure_formats)
+    drawn_names = {figure.name for figure in figures}
+    others = []
+    for figure in registry.installed("figure"):
+        if figure.name not in drawn_names:
+            others.append(figure.name)
+    if others and config.figures != "none":
+        log.info("Not drawn (figures=all, or figures=[own,NAME]): %s", ", ".join(others))
+    return paths

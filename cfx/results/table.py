@@ -9,8 +9,7 @@ reports and figures (`Result.tables`) read them back.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import chain
@@ -24,7 +23,6 @@ import pyarrow.parquet as pq
 
 from cfx.core import registry
 from cfx.core.component import Component
-from cfx.core.distributions import ALL_OWN, OWN
 from cfx.core.files import atomic_write
 from cfx.core.job_folder import unreadable
 from cfx.core.memory import in_units, total_memory
@@ -32,7 +30,6 @@ from cfx.errors import DataError, PluginError
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
-    from rich.table import Table
 
     from cfx.evaluation.result import Evaluation
 
@@ -195,32 +192,6 @@ def installed() -> tuple[registry.Installed[ResultTable], ...]:
     return registry.installed("table")
 
 
-def chosen_tables(
-    chosen: str | Sequence[str], plugins: Collection[str]
-) -> tuple[registry.Installed[ResultTable], ...]:
-    """Returns the tables that a job writes, in their order.
-
-    Args:
-        chosen: `own`: cfx's own, and those of the plugins whose components the job has; `all`: all
-            that are installed; or names, in which `own` may stand.
-        plugins: the distributions of the job's components.
-
-    Raises:
-        PluginError: there is no table of a name.
-    """
-    if chosen == "all":
-        return installed()
-    names = {chosen} if isinstance(chosen, str) else set(chosen)
-    for name in names - {ALL_OWN}:
-        registry.get("table", name)
-    tables = []
-    for table in installed():
-        is_own = table.distribution == OWN or table.distribution in plugins
-        if table.name in names or (ALL_OWN in names and is_own):
-            tables.append(table)
-    return tuple(tables)
-
-
 def file_of(table: registry.Installed[ResultTable]) -> str:
     """Returns the name of a table's file."""
     return table.name + table.component.suffix
@@ -301,31 +272,6 @@ def _metrics_of(
 def _together(table: registry.Installed[ResultTable], evaluation: Evaluation) -> pd.DataFrame:
     """Returns all rows of a large table."""
     return pd.concat(list(parts_of(table, evaluation) or ()))
-
-
-def metrics_table(
-    title: str,
-    methods: Iterable[str],
-    columns: Mapping[str, tuple[str, str]],
-    metrics: Mapping[str, float],
-) -> Table:
-    """Returns a table for the console with a row per method; what is not known is an empty cell.
-
-    `columns`: by heading what a metric is called before `/METHOD`, and how it is formatted.
-    """
-    from rich.table import Table
-
-    table = Table(title=title, title_justify="left")
-    table.add_column("method")
-    for heading in columns:
-        table.add_column(heading, justify="right")
-    for method in methods:
-        cells = []
-        for name, form in columns.values():
-            value = metrics.get(f"{name}/{method}", math.nan)
-            cells.append(f"{value:{form}}" if math.isfinite(value) else "")
-        table.add_row(method, *cells)
-    return table
 
 
 def stored_tables(folder: Path) -> Tables:

@@ -17,6 +17,7 @@ from cfx.app.overrides import override
 from cfx.calibration.calibrator import Calibrator
 from cfx.errors import CfxError, ConfigError, DataError, ParameterError
 from cfx.results.table import stored_tables
+from tests.checkout import needs
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 256}
 LEADER = pd.DataFrame({"time_s": np.arange(600) * 0.1, "speed": 15.0})
@@ -56,7 +57,7 @@ def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
         found.append(calibrated(self, *given))
         return found[-1]
 
-    off = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+    off = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
     folder = tmp_path_factory.mktemp("job") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Calibrator, "fixed", recorded)
@@ -92,11 +93,12 @@ def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
     assert "driver-specific" in repr(fit)
 
 
+@needs("cfx-posteriors")
 def test_a_posterior_is_that_of_the_command_and_gives_new_drivers(
     pairs: cfx.Pairs, tmp_path: Path
 ) -> None:
     fit = cfx.calibrate(pairs, "krauss", **RANDOM, **{"calibration.posterior": "hierarchical"})
-    off = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+    off = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
     folder = tmp_path / "job"
     cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
     fits = pd.read_parquet(folder / "fits.parquet")

@@ -13,6 +13,7 @@ import pytest
 
 import cfx
 from cfx.errors import ConfigError, DataError
+from tests.checkout import needs
 
 RANDOM = {"optimizer": "random", "optimizer.samples": 64}
 SMALL = {
@@ -24,9 +25,9 @@ SMALL = {
     "policy.hidden_size": 4,
     "protocol.folds": 2,
     "learner.ensemble_size": 1,
-    "figures.enabled": False,
+    "figures": "none",
 }
-QUIET = ["tracking.enabled=false", "figures.enabled=false", "cache.enabled=false"]
+QUIET = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +132,7 @@ def test_a_forecast_reads_nothing_after_its_moment(others: cfx.Pairs) -> None:
     assert found[0].paths.groupby("pair_id").size().tolist() == [31, 31]
 
 
+@needs("cfx-forecasts")
 def test_a_forecast_is_that_of_the_protocol_to_the_last_bit(others: cfx.Pairs) -> None:
     policy = "cfx://i80-idm"
     settings = {"protocol.horizons": [2.0], "protocol.stride": 60.0}  # one moment

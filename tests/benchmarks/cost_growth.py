@@ -27,7 +27,7 @@ _FRAMES, _OF_FILE = 300, 1000
 """Frames of each pair, and pairs of each file."""
 
 _JOB = ("data=tidy", "data.min_duration=20", "model=krauss", "optimizer=random")
-_QUIET = ("figures.enabled=false", "tracking.enabled=false", "cache.enabled=false")
+_QUIET = ("figures=none", "tracking.enabled=false", "cache.enabled=false")
 _TRAINED = ("learner.epochs=2",)
 _FIXED = ("policy=fixed",)
 

@@ -12,6 +12,7 @@ from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, write_tidy
 from cfx.errors import DataError
 from cfx.simulation.synthetic import SyntheticDataset
+from tests.checkout import needs
 from tests.drives import straight_pairs
 from tests.installer import Installer
 
@@ -30,6 +31,7 @@ def test_describes_real_tidy_pairs(shared_data: Path) -> None:
     assert line.split()[-1] == "71"
 
 
+@needs("cfx-recordings")
 def test_describes_a_real_raw_recording(shared_data: Path) -> None:
     text = describe(shared_data / "i80_0400_raw_sample.csv.gz").text
     for words in (
@@ -73,6 +75,7 @@ def test_names_pairs_that_are_copies_of_others(tmp_path: Path) -> None:
     assert f"('copy' as '{pairs[2].pair_id}')" in said
 
 
+@needs("cfx-recordings")
 def test_a_file_that_cannot_be_used_says_why(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="no such file"):
         describe(tmp_path / "none.csv")

@@ -21,13 +21,17 @@ from cfx.app import cli
 from cfx.errors import CfxError
 from cfx.evaluation.protocols.transfer import Transfer, TransferSettings
 from cfx.policies import checkpoint
+from tests.broken_plugins import QUICK
+from tests.fuzz.test_fuzz import EXAMPLES, JUNK, damaged, fuzz, leaves, put, said
+
+pytest.importorskip("cfx_report", reason="the report reads folders too")
+pytest.importorskip("cfx_sumo", reason="the export reads folders too")
+
 from cfx_report import inline
 from cfx_report.page import render
 from cfx_report.runs import read_runs
 from cfx_sumo.export import export
 from cfx_sumo.live.driver import Driver
-from tests.broken_plugins import QUICK
-from tests.fuzz.test_fuzz import EXAMPLES, JUNK, damaged, fuzz, leaves, put, said
 
 JOB = [one for one in QUICK if not one.startswith(("policy", "protocol", "learner", "data.pairs"))]
 JOB += ["policy=gru", "learner=imitation", "learner.epochs=1", "policy.hidden_size=4"]

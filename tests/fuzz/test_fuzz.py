@@ -24,12 +24,11 @@ from cfx.app.user_errors import explain, is_user_error
 from cfx.calibration.cache import Cache
 from cfx.core import registry
 from cfx.data.describe import describe
-from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.data.tidy import write_tidy
 from cfx.errors import CfxError
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.mlflow.tracker import MlflowTracker
-from cfx_recordings.ngsim import NgsimDataset
 from tests.agents import adaptive
 from tests.drives import straight_pairs
 
@@ -126,9 +125,15 @@ def table() -> pd.DataFrame:
 TABLE = table()
 
 
+READERS = [
+    registry.get("dataset", name) for name in registry.names("dataset") if name in {"tidy", "ngsim"}
+]
+"""The reader of cfx, and one of a plugin where that is installed."""
+
+
 def examined(path: Path) -> None:
     """Loads and describes a file; only sentences may come of it."""
-    for read in (TidyDataset, NgsimDataset):
+    for read in READERS:
         try:
             read(path=path, min_duration=0).load()
         except CfxError as error:

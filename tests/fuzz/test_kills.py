@@ -31,7 +31,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.timeout(0)]
 
 def command(folder: Path, launcher: tuple[str, ...]) -> list[str]:
     return [
-        *(sys.executable, "-m", "cfx", "-m", "debug=quick", "figures.enabled=true", "seed=1,2,3"),
+        *(sys.executable, "-m", "cfx", "-m", "debug=quick", "figures=all", "seed=1,2,3"),
         *launcher,
         f"hydra.sweep.dir={folder / 'sweep'}",
         f"cache.folder={folder / 'cache'}",

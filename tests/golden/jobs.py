@@ -19,7 +19,7 @@ SMALL = (
     "data.frames=200",
     "data.max_pairs=null",
     "cores=1",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
 )
 _ACROSS = ("data.pairs=6", "protocol=across_drivers", "protocol.folds=2")

@@ -20,6 +20,7 @@ from cfx.policies.driver_step import DriverState, DriverStep, Motion
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.step import advance_vehicle
 from tests.agents import adaptive
+from tests.checkout import needs
 from tests.drives import wavy_pairs
 
 TRUE = torch.tensor([[1.5, 0.1], [2.5, 0.4], [2.0, 0.0]], dtype=torch.float64)
@@ -193,9 +194,13 @@ def test_what_is_no_number_is_refused_and_remembers_nothing(signal: int) -> None
         step(step.begin(3), Motion(v, a), Motion(v_l, a_l), torch.full((3,), 20.0).double())
 
 
-def test_networks_of_single_drivers_and_equations_of_a_simulator_are_refused() -> None:
+def test_networks_of_single_drivers_are_refused() -> None:
     with pytest.raises(DataError, match="2 networks"):
         DriverStep(adaptive({"name": "krauss"}, ("one", "two")))
+
+
+@needs("cfx-sumo")
+def test_equations_of_a_simulator_are_refused() -> None:
     agent = adaptive(
         {
             "name": "sumo_vtype",

@@ -70,7 +70,7 @@ def test_a_sweep_of_two_processes_is_tracked_in_postgresql(database: str, tmp_pa
     done = subprocess.run(
         [
             *(sys.executable, "-m", "cfx", "-m", "debug=quick", "seed=0,1", "cores=1"),
-            *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "figures.enabled=false"),
+            *("hydra/launcher=joblib", "hydra.launcher.n_jobs=2", "figures=none"),
             f"tracking.uri={database}",
         ],
         cwd=tmp_path,

@@ -14,7 +14,6 @@ from cfx.evaluation.result import Evaluation
 from cfx.results.table import (
     Column,
     ResultTable,
-    chosen_tables,
     file_of,
     installed,
     parts_of,
@@ -52,10 +51,10 @@ def test_the_list_of_files_says_what_each_table_holds() -> None:
 def test_a_job_writes_own_tables_those_of_its_plugins_and_those_it_names(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    tables = chosen_tables("own", ())
+    tables = registry.chosen("table", "own", ())
     own = [one.name for one in tables]
     assert "pairs" in own
-    monkeypatch.setattr("cfx.results.table.installed", lambda: (*tables, CENSUS))
+    monkeypatch.setattr("cfx.core.registry.installed", lambda kind: (*tables, CENSUS))
     monkeypatch.setattr(registry, "get", lambda kind, name: Census)
     for chosen, plugins, has_census in (
         ("own", (), False),
@@ -63,9 +62,9 @@ def test_a_job_writes_own_tables_those_of_its_plugins_and_those_it_names(
         (("own", "census"), (), True),
         ("all", (), True),
     ):
-        names = [one.name for one in chosen_tables(chosen, plugins)]
+        names = [one.name for one in registry.chosen("table", chosen, plugins)]
         assert names == [*own, *(["census"] if has_census else [])]
-    assert [one.name for one in chosen_tables(("census",), ())] == ["census"]
+    assert [one.name for one in registry.chosen("table", ("census",), ())] == ["census"]
 
 
 def test_a_table_that_a_protocol_delivers_is_written_and_read_back(tmp_path: Path) -> None:

@@ -28,7 +28,7 @@ QUICK = [
     "optimizer=random",
     "optimizer.samples=16",
     "policy=fixed",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "cache.enabled=false",
 ]

@@ -59,23 +59,37 @@ def overrides_of(words: Sequence[str]) -> list[str]:
         ConfigError: an override chooses a policy that is trained.
         DataError: a file cannot be read, or no dataset knows its layout.
     """
-    given = [word for word in words if "=" in word]
-    files = [Path(word).expanduser() for word in words if "=" not in word]
-    keys = {word.partition("=")[0] for word in given}
-    for word in given:
-        if word.startswith("policy=") and word.partition("=")[2] not in {"fixed", "default"}:
+    given: list[str] = []
+    files: list[Path] = []
+    keys = set()
+    has_named_columns = False
+    for word in words:
+        key, is_override, value = word.partition("=")
+        if not is_override:
+            files.append(Path(word).expanduser())
+            continue
+        if key == "policy" and value not in {"fixed", "default"}:
             raise ConfigError(
                 f"cfx calibrate trains no policy: leave {word} out, or write cfx {word}"
             )
-    found = [f"{key}={value}" for key, value in _CHOSEN.items() if key not in keys]
+        has_named_columns |= word.startswith(("data.columns", "data.units"))
+        keys.add(key)
+        given.append(word)
+    overrides = []
+    for key, value in _CHOSEN.items():
+        if key not in keys:
+            overrides.append(f"{key}={value}")
     if files and "data" not in keys:
         from cfx.data.describe import dataset_of
 
-        own_columns = any(word.startswith(("data.columns", "data.units")) for word in given)
-        found.append(f"data={'tidy' if own_columns else dataset_of(files[0])}")
+        # Names and units of columns are settings of `data=tidy` alone.
+        dataset = "tidy" if has_named_columns else dataset_of(files[0])
+        overrides.append(f"data={dataset}")
     if len(files) == 1:
-        found.append(path_override("data.path", files[0]))
+        overrides.append(path_override("data.path", files[0]))
     elif files:
-        listed = [path_override("", file).removeprefix("=") for file in files]
-        found.append(f"data.path=[{','.join(listed)}]")
-    return [*found, *given]
+        paths = []
+        for file in files:
+            paths.append(path_override("", file).removeprefix("="))
+        overrides.append(f"data.path=[{','.join(paths)}]")
+    return [*overrides, *given]

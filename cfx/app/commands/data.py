@@ -58,16 +58,14 @@ def _describe(options: argparse.Namespace) -> None:
     from cfx.data.sites import with_sites, with_vehicles
     from cfx.data.style import StyleSettings, measure_style, style_distances
 
-    overrides = [word for word in options.files if _is_setting(word)]
-    files = [word for word in options.files if not _is_setting(word)]
+    overrides, files = _overrides_and_files(options.files)
     if not files:
         raise ConfigError("cfx data describe: name the file to look at")
     figure = None if options.figure is None else Path(options.figure).expanduser()
     if figure is not None and figure.suffix not in _FIGURES:
         raise ConfigError(f"--figure {figure}: its name must end in {', '.join(_FIGURES)}")
     settings = _settings(overrides) if overrides else None
-    own = [word for word in overrides if not word.startswith("data=")]
-    words = "".join(f" {shlex.quote(word)}" for word in own)
+    words = _words_to_use_it(overrides)
     read = []
     for file in files:
         description = describe(Path(file), settings, words)
@@ -108,6 +106,27 @@ def _describe(options: argparse.Namespace) -> None:
 
 
 _FIGURES = (".png", ".svg", ".pdf")
+
+
+def _overrides_and_files(words: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Returns the settings and the files among the words of a command line."""
+    overrides: list[str] = []
+    files: list[str] = []
+    for word in words:
+        if _is_setting(word):
+            overrides.append(word)
+        else:
+            files.append(word)
+    return overrides, files
+
+
+def _words_to_use_it(overrides: Sequence[str]) -> str:
+    """Returns what a job that reads the file must be told besides its path, for a shell."""
+    words = ""
+    for override in overrides:
+        if not override.startswith("data="):
+            words += f" {shlex.quote(override)}"
+    return words
 
 
 def _is_setting(word: str) -> bool:

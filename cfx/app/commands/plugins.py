@@ -124,7 +124,8 @@ def _use(entry: registry.Entry, cls: Any) -> str:
         who = "Every job" if entry.distribution == OWN else f"A job with tables=[own,{name}]"
         return f"{who} writes {name}{cls.suffix} where it has rows of it."
     if entry.kind == "figure":
-        return f"Every job that has what it shows draws it: figures/{name}.png."
+        who = "Every job" if entry.distribution == OWN else f"A job with figures=[own,{name}]"
+        return f"{who} draws it where it has what it shows: figures/{name}.png."
     if entry.kind == "metric":
         who = "Every job" if entry.distribution == OWN else f"A job with metrics=[own,{name}]"
         return f"{who} measures it; with {kind.call(name)} no others but those that a job needs."
@@ -166,15 +167,20 @@ def _parameters(cls: Any) -> Table:
     headings = ("parameter", "unit", "low", "high", "default", "tuned", "meaning", "source")
     rows = blank_table(*headings, title="Parameters")
     rows.columns[0].no_wrap = True
-    sources = list(dict.fromkeys(p.source for p in cls.parameters if p.source))
+    numbers: dict[str, int] = {}  # of the sources, in the order in which they are named
+    below = []
     for p in cls.parameters:
-        numbers = [f"{value:g}" for value in (p.low, p.high, p.default)]
         tuned = "yes" if p.tuned else "constant"
         if p.tuned and p.used_with is not None:
             tuned = f"with {p.used_with[0]}={p.used_with[1]}"
-        mark = f"[{sources.index(p.source) + 1}]" if p.source else ""
-        rows.add_row(p.name, p.unit, *numbers, tuned, p.meaning, mark)
-    below = [f"[{number}] {source}" for number, source in enumerate(sources, start=1)]
+        mark = ""
+        if p.source:
+            if p.source not in numbers:
+                numbers[p.source] = len(numbers) + 1
+                below.append(f"[{numbers[p.source]}] {p.source}")
+            mark = f"[{numbers[p.source]}]"
+        low, high, default = f"{p.low:g}", f"{p.high:g}", f"{p.default:g}"
+        rows.add_row(p.name, p.unit, low, high, default, tuned, p.meaning, mark)
     below.append("Change one with model.parameters.NAME.{low,high,default,tuned}=VALUE")
     rows.caption = Text("\n".join(below))
     rows.caption_justify = "left"

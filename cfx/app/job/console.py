@@ -22,7 +22,7 @@ from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import scope_label
-from cfx.figures.text import plural, short_label
+from cfx.figures.wording import plural, short_label
 from cfx.results.result import Result
 from cfx.results.table import ResultTable, installed
 from cfx.simulation.trajectory import TRANSIENT_S

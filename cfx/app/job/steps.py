@@ -47,7 +47,6 @@ from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
 from cfx.results.provenance import commit, distributions, version
 from cfx.results.result import Result
-from cfx.results.table import chosen_tables
 from cfx.results.tracker import folder_of, is_run_id
 from cfx.simulation.base import Simulator
 from cfx.simulation.rollout import MemorySimulator, MemoryStepper
@@ -161,8 +160,11 @@ class JobComponents:
             learner.require_gradients(model, simulator.differentiable)
         if "policy" not in protocol.determines():  # else the policy has been trained already
             learner.require_no_driver_features(policy)
-        # Tables have no state: each is made when it is written. A name that is none is told now.
-        chosen_tables(config.tables, distributions(config.model_dump()))
+        # Tables and figures have no state: each is made when it is written. A name that is none is
+        # told now.
+        plugins = distributions(config.model_dump())
+        registry.chosen("table", config.tables, plugins)
+        registry.chosen("figure", config.figures, plugins)
         demo = None
         if config.demo is not None:
             demo = cast(Demo, registry.create("demo", config.demo))

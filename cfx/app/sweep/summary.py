@@ -13,7 +13,7 @@ from cfx.core.console import blank_table
 from cfx.core.files import atomic_write
 from cfx.errors import DataError
 from cfx.evaluation.headline import main_comparison, summaries_disagree
-from cfx.figures.text import short_label
+from cfx.figures.wording import short_label
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -190,7 +190,7 @@ def test_a_policy_learns_by_rollout_through_the_delay(tmp_path, monkeypatch) -> 
             "optimizer=random",
             "optimizer.samples=32",
             "tracking.enabled=false",
-            "figures.enabled=false",
+            "figures=none",
         ]
     )
     assert math.isfinite(result.metrics["rmse_speed/policy"])

@@ -28,7 +28,7 @@ def test_cfx_recovers_known_drivers(
             "data=synthetic",
             *options,
             "tracking.enabled=false",
-            "figures.enabled=false",
+            "figures=none",
         ]
     )
     truth = cfx.get("dataset", "synthetic")(pairs=3, platoon_size=1, variation=0, frames=400).load()

@@ -114,7 +114,7 @@ def test_a_job_trains_it_and_what_is_saved_drives_the_same(
         "data.frames=200",
         "learner.epochs=6",
         "tracking.enabled=false",
-        "figures.enabled=false",
+        "figures=none",
     ]
     result = cfx.run(["policy=tcn", "policy.channels=8", "policy.levels=2", *quick])
     assert isinstance(result.policy.core.network, TcnNetwork)

@@ -51,7 +51,10 @@ def write_returns_the_files_in_its_folder(demo: Demo) -> None:
         folder.mkdir()
         protocol = {"name": "within_driver"}
         paths = demo.write(folder, pairs, result.policy, result.evaluation, protocol)
-        written = {path for path in folder.rglob("*") if path.is_file()}
+        written = set()
+        for path in folder.rglob("*"):
+            if path.is_file():
+                written.add(path)
         assert set(paths) == written, (
             "`write` returns the files that it has written, which MLflow then keeps:"
             f" {sorted(path.name for path in written.symmetric_difference(paths))}"

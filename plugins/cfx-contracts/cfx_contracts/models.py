@@ -79,7 +79,10 @@ def every_parameter_says_what_it_is(model: DrivingModel) -> None:
 
 
 def constants_can_be_tuned_and_tuned_parameters_fixed(model: DrivingModel) -> None:
-    constants = [parameter.name for parameter in model.space if not parameter.tuned]
+    constants = []
+    for parameter in model.space:
+        if not parameter.tuned:
+            constants.append(parameter.name)
     everything = _with_tuned(model, dict.fromkeys(constants, True))
     assert set(everything.space.names) == {parameter.name for parameter in model.space}, (
         "`model.parameters.NAME.tuned=true` must turn a constant into a tuned parameter; build"
@@ -97,7 +100,10 @@ def every_tuned_parameter_changes_a_trajectory(model: DrivingModel) -> None:
     require_equations(model)
     for variant, said in _variants(model):
         moved = _largest_changes(variant)
-        dead = [name for name, change in moved.items() if change < _FELT]
+        dead = []
+        for name, change in moved.items():
+            if change < _FELT:
+                dead.append(name)
         assert not dead, (
             f"{', '.join(dead)} changes no trajectory{said}, from bound to bound behind leaders in"
             " stop-and-go and on a free road: whatever calibration finds for it is arbitrary"
@@ -183,7 +189,10 @@ def gradients_are_right(model: DrivingModel) -> None:
         raise NotApplicable("the model does not claim to be differentiable")
     states = ordinary(model)
     follower, leader, p = states
-    names = [name for name, value in p.items() if value.dim()]
+    names = []
+    for name, value in p.items():
+        if value.dim():
+            names.append(name)
 
     def step(*inputs: Tensor) -> Tensor:
         states, values = inputs[:5], inputs[5:]

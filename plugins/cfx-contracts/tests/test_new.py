@@ -16,8 +16,10 @@ from cfx.app import cli
 from cfx.core import registry
 from cfx.errors import ConfigError, OutputError, PluginError
 from cfx_contracts.new import create
-from tests.checkout import ROOT
+from tests.checkout import ROOT, module_of
 from tests.installer import Installer
+
+templates = module_of(ROOT / "plugins" / "cfx-contracts" / "templates.py")
 
 NOVEL = [kind for kind in registry.every_kind() if kind != "section"]
 """Every kind of cfx's own; cfx-report adds sections where it is imported."""
@@ -26,6 +28,19 @@ NOVEL = [kind for kind in registry.every_kind() if kind != "section"]
 GENERATED = [
     pytest.param(kind, marks=[] if kind == "model" else pytest.mark.slow) for kind in NOVEL
 ]
+
+
+def test_templates_are_the_examples_components() -> None:
+    """Each kind has a component in cfx-example, whose files `make conf` turns into templates."""
+    assert {kind for kind, _, _ in templates.components()} == set(NOVEL)
+    written = {}
+    for path in templates.TEMPLATES.rglob("*.jinja"):
+        written[path.relative_to(templates.TEMPLATES)] = path.read_text(encoding="utf-8")
+    from_example = templates.texts()
+    common = {path for path in written if path.parts[0] == "common"}
+    assert set(written) - common == set(from_example), "make conf"
+    for path, text in from_example.items():
+        assert written[path] == text, f"{path}: make conf"
 
 
 @pytest.mark.parametrize("kind", GENERATED)

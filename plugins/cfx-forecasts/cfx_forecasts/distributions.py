@@ -20,7 +20,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.plugin import Origins, PairBatch, PairSet, Paths
+from cfx.plugin import PairBatch, PairSet, forecasts
 
 Array = NDArray[np.float64]
 
@@ -89,7 +89,7 @@ class Sampled(NamedTuple):
     travelled: Array
 
     @classmethod
-    def of(cls, paths: Paths) -> Sampled:
+    def of(cls, paths: forecasts.Paths) -> Sampled:
         """Takes paths `(S, Q, K + 1)`, or single ones `(Q, K + 1)`."""
         speed = np.asarray(paths.speed.double().cpu().numpy())
         travelled = np.asarray(paths.travelled.double().cpu().numpy())
@@ -117,7 +117,9 @@ class Recorded(NamedTuple):
     exists: NDArray[np.bool_]
 
     @classmethod
-    def of(cls, batch: PairBatch, origins: Origins, measured: Paths, exists: object) -> Recorded:
+    def of(
+        cls, batch: PairBatch, origins: forecasts.Origins, measured: forecasts.Paths, exists: object
+    ) -> Recorded:
         """Takes what followers did (`measured_paths`), and looks up their leaders."""
         steps = measured.speed.shape[1]
         frames = np.arange(steps) + origins.frame.cpu().numpy()[:, None]
@@ -147,8 +149,8 @@ class Recorded(NamedTuple):
 
 def score_distributions(
     pairs: PairSet,
-    origins: Origins,
-    paths: Mapping[str, Paths],
+    origins: forecasts.Origins,
+    paths: Mapping[str, forecasts.Paths],
     recorded: Recorded,
     horizons: Sequence[float],
     dt: float,
@@ -223,19 +225,19 @@ def sampled_methods(table: pd.DataFrame) -> tuple[str, ...]:
     return tuple(sorted(several, key=lambda method: method == "policy"))
 
 
-def centre_errors(forecasts: pd.DataFrame) -> pd.DataFrame:
+def centre_errors(table: pd.DataFrame) -> pd.DataFrame:
     """Returns the absolute error of speed of the policy where nothing is drawn.
 
     It is what the CRPS of a distribution is that has no width.
 
     Args:
-        forecasts: the table of single forecasts.
+        table: of single forecasts.
 
     Returns:
         A row per horizon: horizon_s, crps_speed (m/s; mean over drivers of each driver's mean over
         origins).
     """
-    rows = forecasts[forecasts["method"] == "policy"]
+    rows = table[table["method"] == "policy"]
     rows = rows.assign(crps_speed=rows["speed_error"].abs())
     of_driver = rows.groupby(["horizon_s", "driver"], sort=True)["crps_speed"].mean()
     return of_driver.groupby("horizon_s").mean().reset_index()

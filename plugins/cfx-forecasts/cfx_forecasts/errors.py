@@ -14,7 +14,7 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.plugin import FORECAST, Origins, PairBatch, PairSet, Paths, extrapolated, mean_interval
+from cfx.plugin import FORECAST, PairBatch, PairSet, forecasts, statistics
 
 SCOPE = FORECAST
 """The scope of forecasts in the long table, and what their metrics begin with."""
@@ -117,9 +117,9 @@ def forecast_methods(table: pd.DataFrame) -> tuple[str, ...]:
 
 def forecast_errors(
     pairs: PairSet,
-    origins: Origins,
-    paths: Mapping[str, Paths],
-    measured: Paths,
+    origins: forecasts.Origins,
+    paths: Mapping[str, forecasts.Paths],
+    measured: forecasts.Paths,
     recorded: Tensor,
     horizons: Sequence[float],
     dt: float,
@@ -199,7 +199,7 @@ def summarize_forecasts(table: pd.DataFrame, by: str = "horizon_s") -> pd.DataFr
         row |= {error: float(found[error].mean()) for error in ERRORS}
         drivers = found["driver"].astype(str).tolist()
         for error in _QUADRATIC:
-            _, low, high = mean_interval(found[error].tolist(), drivers)
+            _, low, high = statistics.mean_interval(found[error].tolist(), drivers)
             row |= {f"{error}_low": low, f"{error}_high": high}
         row |= {"drivers": len(found), "origins": int(found["origins"].sum())}
         rows.append(row)
@@ -239,7 +239,9 @@ def _array(values: Tensor) -> np.ndarray:
     return np.asarray(values.double().cpu().numpy())
 
 
-def kinematic_paths(batch: PairBatch, origins: Origins, steps: int, *, accelerates: bool) -> Paths:
+def kinematic_paths(
+    batch: PairBatch, origins: forecasts.Origins, steps: int, *, accelerates: bool
+) -> forecasts.Paths:
     """Returns followers that go on as they do at the origin: at constant speed or acceleration.
 
     Nobody drives backwards: who brakes, stops.
@@ -254,4 +256,4 @@ def kinematic_paths(batch: PairBatch, origins: Origins, steps: int, *, accelerat
     acceleration = torch.zeros_like(speed)
     if accelerates:
         acceleration = batch.follower_acceleration[origins.pair, origins.frame]
-    return extrapolated(speed, acceleration, steps, batch.dt)
+    return forecasts.extrapolated(speed, acceleration, steps, batch.dt)

@@ -9,25 +9,7 @@ import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from cfx.plugin import (
-    DASHES,
-    EDGE,
-    HIDDEN,
-    INK,
-    Array,
-    JobFigure,
-    Line,
-    PairTrajectory,
-    Result,
-    canvas,
-    colour_of,
-    draw_lines,
-    logarithmic,
-    mark_points,
-    method_legend,
-    side_by_side,
-    styled,
-)
+from cfx.plugin import JobFigure, PairTrajectory, Result, canvas, colours
 from cfx_forecasts.distributions import (
     LEVEL,
     centre_errors,
@@ -44,7 +26,7 @@ _ERRORS = (("rmse_speed", "RMSE of speed (m/s)"), ("rmse_position", "RMSE of pos
 _PANELS = 3
 
 
-@styled
+@canvas.styled
 def draw_by_horizon(summary: pd.DataFrame, methods: Sequence[str]) -> Figure:
     """Draw errors of speed and of position against the horizon.
 
@@ -52,15 +34,17 @@ def draw_by_horizon(summary: pd.DataFrame, methods: Sequence[str]) -> Figure:
         summary: as `summarize_forecasts` returns it.
         methods: those to show.
     """
-    figure = canvas(4.4)
-    for axes, (error, title) in zip(side_by_side(figure, [1] * len(_ERRORS)), _ERRORS, strict=True):
+    figure = canvas.blank(4.4)
+    for axes, (error, title) in zip(
+        canvas.side_by_side(figure, [1] * len(_ERRORS)), _ERRORS, strict=True
+    ):
         _draw_panel(axes, _lines(summary, methods, "horizon_s", error), title, HORIZON_TITLE)
-        logarithmic(axes)
-    method_legend(figure, methods)
+        canvas.logarithmic(axes)
+    canvas.method_legend(figure, methods)
     return figure
 
 
-@styled
+@canvas.styled
 def draw_by_history(by_history: pd.DataFrame, methods: Sequence[str]) -> Figure:
     """Draw a panel for a short, a middle and a long horizon.
 
@@ -70,29 +54,31 @@ def draw_by_history(by_history: pd.DataFrame, methods: Sequence[str]) -> Figure:
     """
     horizons = sorted(by_history["horizon_s"].unique())
     chosen = sorted({horizons[0], horizons[len(horizons) // 2], horizons[-1]})[:_PANELS]
-    figure = canvas(4.4)
-    grid = side_by_side(figure, [1] * len(chosen))
+    figure = canvas.blank(4.4)
+    grid = canvas.side_by_side(figure, [1] * len(chosen))
     for axes, horizon in zip(grid, chosen, strict=True):
         rows = by_history[by_history["horizon_s"] == horizon]
         title = f"RMSE of speed after {horizon:g} s (m/s)"
         _draw_panel(axes, _lines(rows, methods, "span_s", "rmse_speed"), title, HISTORY_TITLE)
         axes.set_ylim(bottom=0)
-    method_legend(figure, methods)
+    canvas.method_legend(figure, methods)
     return figure
 
 
-def _lines(table: pd.DataFrame, methods: Sequence[str], against: str, error: str) -> list[Line]:
+def _lines(
+    table: pd.DataFrame, methods: Sequence[str], against: str, error: str
+) -> list[canvas.Line]:
     lines = []
     for method in methods:
         rows = table[table["method"] == method].sort_values(against)
         seconds = rows[against].to_numpy(dtype=float)
-        lines.append(Line(method, seconds, rows[error].to_numpy(dtype=float)))
+        lines.append(canvas.Line(method, seconds, rows[error].to_numpy(dtype=float)))
     return lines
 
 
-def _draw_panel(axes: Axes, lines: Sequence[Line], title: str, against: str) -> None:
-    draw_lines(axes, lines)
-    mark_points(axes)
+def _draw_panel(axes: Axes, lines: Sequence[canvas.Line], title: str, against: str) -> None:
+    canvas.draw_lines(axes, lines)
+    canvas.mark_points(axes)
     axes.set_xlabel(against)
     axes.set_ylabel(title)
 
@@ -102,7 +88,7 @@ def sampled_name(method: str) -> str:
     return "policy_sampled" if method == "policy" else method
 
 
-def pit_density(rows: pd.DataFrame) -> Array:
+def pit_density(rows: pd.DataFrame) -> canvas.Array:
     """Return the histogram of the PIT of one method, `(PIT_BINS,)`, in which drivers count alike.
 
     Where reality lies among the sampled speeds, from 0 to 1; 1 everywhere if all is well.
@@ -114,7 +100,7 @@ def pit_density(rows: pd.DataFrame) -> Array:
     return np.asarray(np.mean(found, axis=0))
 
 
-@styled
+@canvas.styled
 def draw_distributions(table: pd.DataFrame, forecasts: pd.DataFrame) -> Figure:
     """Draw CRPS and coverage against the horizon, and the PIT of the horizon nearest to 3 s.
 
@@ -123,8 +109,8 @@ def draw_distributions(table: pd.DataFrame, forecasts: pd.DataFrame) -> Figure:
         forecasts: single ones of the same origins; the policy's centre is in the first panel, with
             its absolute error.
     """
-    figure = canvas(4.2)
-    crps, coverage, pit = side_by_side(figure, (1, 1, 1))
+    figure = canvas.blank(4.2)
+    crps, coverage, pit = canvas.side_by_side(figure, (1, 1, 1))
     summary = summarize_distributions(table)
     summary["method"] = summary["method"].astype(str).map(sampled_name)
     sampled = sampled_methods(table)
@@ -133,10 +119,10 @@ def draw_distributions(table: pd.DataFrame, forecasts: pd.DataFrame) -> Figure:
     crps_lines = _lines(summary, names, "horizon_s", "crps_speed")
     crps_lines += _lines(centre, ["policy"], "horizon_s", "crps_speed")
     _draw_panel(crps, crps_lines, "CRPS of speed (m/s)", HORIZON_TITLE)
-    logarithmic(crps)
+    canvas.logarithmic(crps)
     title = f"share within the central {100 * LEVEL:.0f} %"
     _draw_panel(coverage, _lines(summary, names, "horizon_s", "coverage"), title, HORIZON_TITLE)
-    coverage.axhline(LEVEL, color=EDGE, linewidth=1.0, zorder=1)
+    coverage.axhline(LEVEL, color=colours.EDGE, linewidth=1.0, zorder=1)
     coverage.set_ylim(0.0, 1.0)
     horizon = min(sorted(table["horizon_s"].unique()), key=lambda seconds: abs(seconds - 3.0))
     here = table[table["horizon_s"] == horizon]
@@ -144,15 +130,15 @@ def draw_distributions(table: pd.DataFrame, forecasts: pd.DataFrame) -> Figure:
         pit.stairs(
             pit_density(here[here["method"] == method]),
             [k / PIT_BINS for k in range(PIT_BINS + 1)],
-            color=colour_of(name),
-            linestyle=DASHES.get(name, "solid"),
+            color=colours.colour_of(name),
+            linestyle=canvas.DASHES.get(name, "solid"),
             linewidth=1.6,
         )
-    pit.axhline(1.0, color=EDGE, linewidth=1.0, zorder=1)
+    pit.axhline(1.0, color=colours.EDGE, linewidth=1.0, zorder=1)
     pit.set_xlabel("share of samples below reality")
     pit.set_ylabel(f"density, {horizon:g} s ahead")
     pit.set_ylim(bottom=0)
-    method_legend(figure, [*names, "policy"])
+    canvas.method_legend(figure, [*names, "policy"])
     return figure
 
 
@@ -224,7 +210,7 @@ _LEAST = 0.9
 
 def errors_over_time(
     trajectories: Sequence[PairTrajectory], method: str, signal: str
-) -> tuple[Array, Array]:
+) -> tuple[canvas.Array, canvas.Array]:
     """Returns seconds since the test part began, and the RMSE over the pairs that last so long.
 
     Args:
@@ -244,11 +230,11 @@ def errors_over_time(
             simulated, real = trajectory.gap[method], trajectory.real_gap
         row[: len(real)] = (simulated - real) ** 2
     frames = int((np.isfinite(squares).mean(axis=0) >= _LEAST).sum())
-    seconds: Array = longest.time[:frames] - longest.time[0]
+    seconds: canvas.Array = longest.time[:frames] - longest.time[0]
     return seconds, np.sqrt(np.nanmean(squares[:, :frames], axis=0))
 
 
-@styled
+@canvas.styled
 def draw_errors(
     trajectories: Sequence[PairTrajectory], methods: Sequence[str], transient_s: float
 ) -> Figure:
@@ -262,22 +248,22 @@ def draw_errors(
         methods: those to show.
         transient_s: where the transient ends, s; the errors after it are the metrics `steady/...`.
     """
-    figure = canvas(3.9)
+    figure = canvas.blank(3.9)
     for axes, (signal, unit) in zip(
-        side_by_side(figure, (1, 1)), (("speed", "m/s"), ("gap", "m")), strict=True
+        canvas.side_by_side(figure, (1, 1)), (("speed", "m/s"), ("gap", "m")), strict=True
     ):
         lines = []
         for method in methods:
             seconds, error = errors_over_time(trajectories, method, signal)
-            lines.append(Line(method, seconds, error))
-        draw_lines(axes, lines)
+            lines.append(canvas.Line(method, seconds, error))
+        canvas.draw_lines(axes, lines)
         axes.set_xlabel(TIME_TITLE)
         axes.set_ylabel(f"RMSE of {signal} over pairs ({unit})")
         axes.set_ylim(bottom=0)
-        axes.axhline(0, color=INK, linewidth=0.9)
+        axes.axhline(0, color=colours.INK, linewidth=0.9)
         if any(line.time[-1:] > transient_s for line in lines):
-            axes.axvline(transient_s, color=EDGE, linewidth=0.9, linestyle=(0, (4, 2)))
-    method_legend(figure, methods)
+            axes.axvline(transient_s, color=colours.EDGE, linewidth=0.9, linestyle=(0, (4, 2)))
+    canvas.method_legend(figure, methods)
     return figure
 
 
@@ -299,6 +285,6 @@ class ErrorOverTime(JobFigure):
         simulated = result.trajectories[0].speed
         methods = []
         for method in result.shown_methods:
-            if method in simulated and method not in HIDDEN:
+            if method in simulated and method not in canvas.HIDDEN:
                 methods.append(method)
         return draw_errors(result.trajectories, methods, result.transient_s)

@@ -13,7 +13,6 @@ from torch import Tensor
 from cfx.errors import ConfigError
 from cfx.plugin import (
     NOISE_SCALE,
-    RELAXATION_TIME,
     Agent,
     AgentCore,
     ConstantNetwork,
@@ -23,6 +22,7 @@ from cfx.plugin import (
     Scaler,
     Stepper,
     StochasticHead,
+    composed,
     features_read,
 )
 from cfx_forecasts.residuals import measure_residuals
@@ -42,7 +42,7 @@ def residual_noise(test: HeldOut, parameters: Tensor, *, own: bool) -> tuple[Ten
     model, windows = test.context.stepper.model, test.context.windows
     lag = windows.stride * test.batch.dt
     found = measure_residuals(model, test.batch, parameters, test.first, lag)
-    usual = found.time.nanmean().nan_to_num(RELAXATION_TIME.default)
+    usual = found.time.nanmean().nan_to_num(composed.RELAXATION_TIME.default)
     time = torch.where(found.time.isnan(), usual, found.time)
     if own:
         return time, found.scale
@@ -70,7 +70,7 @@ def constant_with_noise(
     model, device = context.stepper.model, parameters.device
     head = StochasticHead.for_model(model, device).of_acceleration()
     complete = head.completed(parameters).clone()
-    for parameter, values in ((RELAXATION_TIME, time), (NOISE_SCALE, scale)):
+    for parameter, values in ((composed.RELAXATION_TIME, time), (NOISE_SCALE, scale)):
         column = head.space.names.index(parameter.name)
         complete[:, column] = values.clamp(parameter.low, parameter.high)
     policy = FixedPolicy()

@@ -21,16 +21,12 @@ from cfx.plugin import (
     FoldsOrFinishedSettings,
     Followers,
     HeldOut,
-    LeaderFuture,
-    Origins,
-    Paths,
     ProtocolContext,
     ProtocolResult,
     Settings,
     base_of,
+    forecasts,
     in_text,
-    measured_paths,
-    sample_from_origins,
 )
 from cfx_forecasts.distributions import Recorded, score_distributions
 from cfx_forecasts.errors import forecast_errors, forecast_values, kinematic_paths
@@ -60,7 +56,7 @@ class ForecastSettings(FoldsOrFinishedSettings):
         description="s of measured history before a driver's first origin, on which driver-specific"
         " parameters are calibrated; null: the share `split` of the trajectory",
     )
-    leader: LeaderFuture = Field(
+    leader: forecasts.LeaderFuture = Field(
         "given",
         description="what is known of the leader after an origin: given: what they did;"
         " constant_speed, constant_acceleration: they go on as at the origin",
@@ -162,14 +158,16 @@ class Forecast(FoldsOrFinished):
         dt = batch.dt
         test = self._from_history(test)
         shortest = round(s.horizons[0] / dt)
-        origins = Origins.every(round(s.stride / dt), test.first, batch.lengths - 1 - shortest)
+        origins = forecasts.Origins.every(
+            round(s.stride / dt), test.first, batch.lengths - 1 - shortest
+        )
         if len(origins) == 0:
             raise DataError(
                 "no trajectory goes on for protocol.horizons after its first origin; lower"
                 " protocol.min_history, split or protocol.horizons, or use longer trajectories"
             )
         steps = round(s.horizons[-1] / dt)
-        measured, recorded = measured_paths(batch, origins, steps)
+        measured, recorded = forecasts.measured_paths(batch, origins, steps)
         self._say_who_is_forecast(test, origins)
         paths = self._paths(test, origins, steps)
         about = (test.pairs, origins)
@@ -192,7 +190,7 @@ class Forecast(FoldsOrFinished):
             "history_s": [float(of_one["history_s"].min()), float(of_one["history_s"].max())],
         }
 
-    def _say_who_is_forecast(self, test: HeldOut, origins: Origins) -> None:
+    def _say_who_is_forecast(self, test: HeldOut, origins: forecasts.Origins) -> None:
         """Logs how many drivers there are forecasts of, and horizons that few or none reach."""
         drivers = np.asarray([pair.driver for pair in test.pairs], dtype=object)
         left = test.batch.lengths[origins.pair] - 1 - origins.frame
@@ -229,7 +227,9 @@ class Forecast(FoldsOrFinished):
             base = base_of(test.policy, fixed)
         return replace(test, first=first, fixed=fixed, base=base)
 
-    def _paths(self, test: HeldOut, origins: Origins, steps: int) -> dict[str, Paths]:
+    def _paths(
+        self, test: HeldOut, origins: forecasts.Origins, steps: int
+    ) -> dict[str, forecasts.Paths]:
         """Returns the paths of all methods."""
         batch, context = test.batch, test.context
         paths = {
@@ -250,10 +250,12 @@ class Forecast(FoldsOrFinished):
                 agents[name] = (agent, network)
         for name, (agent, network) in agents.items():
             found = self._from_origins(test, agent, origins, steps, network, (None,))
-            paths[name] = Paths(found.speed[0], found.travelled[0])
+            paths[name] = forecasts.Paths(found.speed[0], found.travelled[0])
         return paths
 
-    def _sampled(self, test: HeldOut, origins: Origins, steps: int) -> dict[str, Paths]:
+    def _sampled(
+        self, test: HeldOut, origins: forecasts.Origins, steps: int
+    ) -> dict[str, forecasts.Paths]:
         """Returns sampled paths `(S, Q, K + 1)` of the methods that leave something to chance."""
         context, each = test.context, torch.arange(len(test.batch), device=origins.pair.device)
         agents = {}
@@ -278,16 +280,16 @@ class Forecast(FoldsOrFinished):
         self,
         test: HeldOut,
         agent: Agent,
-        origins: Origins,
+        origins: forecasts.Origins,
         steps: int,
         network: Tensor,
         generators: Sequence[torch.Generator | None],
-    ) -> Paths:
+    ) -> forecasts.Paths:
         """Returns paths `(S, Q, K + 1)` of an agent."""
         base: Tensor | None = test.unseen_base if test.base is None else test.base
         if agent is not test.policy:
             base = None  # it has a base for each driver, or needs none
-        return sample_from_origins(
+        return forecasts.sample_from_origins(
             test.context.stepper,
             agent,
             Followers(test.batch, network, base, test.policy.context_rule.history_s),

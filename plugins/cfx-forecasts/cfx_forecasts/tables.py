@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping
 
 from rich.table import Table
 
-from cfx.plugin import Column, Evaluation, ResultTable, metrics_table
+from cfx.plugin import Column, Evaluation, ResultTable
+from cfx_forecasts.console import metrics_table
 from cfx_forecasts.distributions import LEVEL, centre_errors, distribution_metrics, sampled_methods
 from cfx_forecasts.errors import SCOPE, forecast_methods, forecast_metrics, metric_name
 

@@ -7,8 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
+from cfx.figures.colours import colour_of
 from cfx.figures.drawing import draw_figure, figure_named
-from cfx.figures.text import colour_of
 from cfx.results.result import Result
 from cfx_forecasts.distributions import centre_errors, summarize_distributions
 from cfx_forecasts.errors import errors_by_history, forecast_methods, summarize_forecasts

@@ -27,7 +27,7 @@ from cfx.plugin import (
     SegmentLosses,
     Segments,
     Solver,
-    install_line,
+    distributions,
     squashed,
 )
 from cfx_posteriors.density import ParameterPrior, Posterior
@@ -192,7 +192,7 @@ class SbiMethod(PosteriorMethod):
         if importlib.util.find_spec("sbi") is None:
             raise NotInstalledError(
                 "calibration.posterior=sbi needs sbi, which is not installed; it comes with"
-                f" {install_line('cfx-posteriors[sbi]')}"
+                f" {distributions.install_line('cfx-posteriors[sbi]')}"
             )
 
     def find(

@@ -20,11 +20,11 @@ from cfx.errors import DataError
 from cfx.plugin import (
     DrivingModel,
     ExportFormat,
-    create,
+    files,
     folder_of,
-    read_yaml,
+    job_folder,
+    registry,
     stored_tables,
-    write_output,
 )
 
 NAME = "posterior.nc"
@@ -61,13 +61,13 @@ class NetcdfExport(ExportFormat):
                 f"{run}: this job has found no posterior; run one with"
                 " calibration.posterior=laplace, nuts, sbi or hierarchical"
             )
-        node = read_yaml(folder / "config.yaml")["model"]
-        tree = inference_data(tables, cast(DrivingModel, create("model", node)))
+        node = job_folder.read_yaml(folder / "config.yaml")["model"]
+        tree = inference_data(tables, cast(DrivingModel, registry.create("model", node)))
         with tempfile.TemporaryDirectory(prefix="cfx-") as name:
             path = Path(name, NAME)
             tree.to_netcdf(path, engine="h5netcdf")
             content = path.read_bytes()
-        write_output(output, content, "the posterior")
+        files.write_output(output, content, "the posterior")
         sizes = tree["posterior"].sizes
         return [
             f"{output}: {sizes['chain'] * sizes['draw']} draws for each of {sizes['pair']} pairs,"

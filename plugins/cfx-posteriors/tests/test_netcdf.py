@@ -21,7 +21,7 @@ from cfx_posteriors.netcdf import NetcdfExport
     ("method", "others"), [("laplace", "prior"), ("hierarchical", "population")]
 )
 def test_a_jobs_posterior_is_labelled_arrays(method: str, others: str, tmp_path: Path) -> None:
-    quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures.enabled=false"]
+    quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures=none"]
     job = [f"hydra.run.dir={tmp_path}/job", "tracking.enabled=false"]
     found = cfx.run([*quick, *job, f"calibration.posterior={method}"])
     said = NetcdfExport().write(str(found.folder), None)
@@ -41,7 +41,7 @@ def test_a_jobs_posterior_is_labelled_arrays(method: str, others: str, tmp_path:
 def test_chains_are_a_dimension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(nuts, "WARM_UP", 50)
     monkeypatch.setattr(nuts, "DRAWS", 50)
-    quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures.enabled=false"]
+    quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures=none"]
     job = [f"hydra.run.dir={tmp_path}/job", "tracking.enabled=false"]
     found = cfx.run([*quick, *job, "calibration.posterior=nuts"])
     NetcdfExport().write(str(found.folder), None)

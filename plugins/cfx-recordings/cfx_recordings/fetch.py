@@ -27,7 +27,7 @@ from urllib.parse import urlsplit
 from filelock import FileLock, Timeout
 
 from cfx.errors import ConfigError, DataError, OutputError
-from cfx.plugin import Task, atomic_write
+from cfx.plugin import Task, files
 from cfx_recordings.ngsim import MOTORWAY
 
 if TYPE_CHECKING:
@@ -297,7 +297,7 @@ def _fetch_pages(service: Service, query: Query, kept: Path) -> None:
     with Task(f"downloading from {service.name}", missing_rows) as task:
         for offset, rows in missing:
             text = service.page(query, offset, rows)
-            with atomic_write(_page(kept, offset)) as partial:
+            with files.atomic_write(_page(kept, offset)) as partial:
                 partial.write_text(text, encoding="utf-8", newline="")
             task.advance(rows)
 
@@ -322,7 +322,7 @@ def _start_over_if_changed(query: Query, kept: Path) -> None:
         log.info("%s: the service's data or the question has changed; starting over", kept)
     for page in old:
         page.unlink()
-    with atomic_write(note) as partial:
+    with files.atomic_write(note) as partial:
         partial.write_text(now, encoding="utf-8")
 
 
@@ -341,7 +341,10 @@ def _join(kept: Path, query: Query, path: Path, recording: str) -> int:
     """Writes the pages' rows that are of the recording to one file; returns their number."""
     written = 0
     earliest, latest = math.inf, 0.0
-    with atomic_write(path) as partial, partial.open("w", encoding="utf-8", newline="") as file:
+    with (
+        files.atomic_write(path) as partial,
+        partial.open("w", encoding="utf-8", newline="") as file,
+    ):
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(COLUMNS)
         for offset, _ in query.pages():

@@ -37,10 +37,10 @@ class FetchCommand(Command):
         return parser
 
     def run(self, options: argparse.Namespace) -> int:
-        from cfx.plugin import console_logging, path_override
+        from cfx.plugin import console, files
         from cfx_recordings.fetch import URL, fetch_ngsim_i80
 
-        with console_logging(), console_logging("cfx_recordings"):
+        with console.console_logging(), console.console_logging("cfx_recordings"):
             path = fetch_ngsim_i80(
                 Path(options.folder).expanduser(),
                 options.part,
@@ -48,5 +48,6 @@ class FetchCommand(Command):
                 force=options.force,
             )
         print(f"Look at it: python -m cfx data describe {shlex.quote(str(path))}")
-        print(f"Use it: python -m cfx data=ngsim {shlex.quote(path_override('data.path', path))}")
+        override = shlex.quote(files.path_override("data.path", path))
+        print(f"Use it: python -m cfx data=ngsim {override}")
         return 0

@@ -24,14 +24,13 @@ from cfx.plugin import (
     Layout,
     PairSet,
     Settings,
-    Statement,
     Table,
     Tracks,
     extract_pairs,
     joined,
     read_table,
-    remarks_of,
-    rows_ahead,
+    statements,
+    tracks,
     with_sites,
 )
 
@@ -167,7 +166,7 @@ def _tracks(path: Path, about: Table) -> Tracks:
     _check(table, speed)
     order = np.lexsort((numbers["frame"], numbers["id"]))
     front = np.where(to_right, numbers["x"] + numbers["width"], -numbers["x"])
-    tracks = Tracks(
+    drives = Tracks(
         source=str(path),
         dt=1.0 / float(about.numbers["frameRate"][0]),
         recordings=(f"highd-{path.name.removesuffix(_TRACKS)}",),
@@ -184,29 +183,35 @@ def _tracks(path: Path, about: Table) -> Tracks:
         driver_types=vehicles.kinds,
     )
     said = {name: numbers[name][order] for name in _TWICE if name in numbers}
-    return replace(tracks, remarks=remarks_of(_said_twice(tracks, said)))
+    return replace(drives, remarks=statements.remarks_of(_said_twice(drives, said)))
 
 
-def _said_twice(tracks: Tracks, said: Mapping[str, Floats]) -> Iterator[Statement]:
+def _said_twice(vehicles: Tracks, said: Mapping[str, Floats]) -> Iterator[statements.Statement]:
     """Yields what columns say that follows from others too; 0 stands where nobody is ahead."""
-    ahead, has_row = rows_ahead(tracks)
-    headway = np.where(has_row, tracks.position[ahead] - tracks.position, np.nan)
+    ahead, has_row = tracks.rows_ahead(vehicles)
+    headway = np.where(has_row, vehicles.position[ahead] - vehicles.position, np.nan)
     if "precedingXVelocity" in said:
-        speed = np.where(has_row, tracks.speed[ahead], np.nan)
+        speed = np.where(has_row, vehicles.speed[ahead], np.nan)
         leaders = np.abs(said["precedingXVelocity"])
-        yield Statement("precedingXVelocity", leaders, [speed], "the leader's xVelocity", 0.02)
+        yield statements.Statement(
+            "precedingXVelocity", leaders, [speed], "the leader's xVelocity", 0.02
+        )
     if "dhw" not in said:
         return
-    gap = headway - tracks.length[ahead]
-    yield Statement("dhw", said["dhw"], [headway, gap], "x and width of a vehicle and its leader")
-    moves = np.where(tracks.speed > 0, tracks.speed, np.nan)
+    gap = headway - vehicles.length[ahead]
+    yield statements.Statement(
+        "dhw", said["dhw"], [headway, gap], "x and width of a vehicle and its leader"
+    )
+    moves = np.where(vehicles.speed > 0, vehicles.speed, np.nan)
     if "thw" in said:
-        yield Statement("thw", said["thw"], [said["dhw"] / moves], "dhw and xVelocity", 0.02)
+        yield statements.Statement(
+            "thw", said["thw"], [said["dhw"] / moves], "dhw and xVelocity", 0.02
+        )
     if "ttc" in said:
-        closing = np.abs(np.where(has_row, tracks.speed - tracks.speed[ahead], np.nan))
+        closing = np.abs(np.where(has_row, vehicles.speed - vehicles.speed[ahead], np.nan))
         until = said["dhw"] / np.where(closing > _CLOSING_MPS, closing, np.nan)
         basis = "dhw and xVelocity of a vehicle and its leader"
-        yield Statement("ttc", np.abs(said["ttc"]), [until], basis, 0.02)
+        yield statements.Statement("ttc", np.abs(said["ttc"]), [until], basis, 0.02)
 
 
 def _beside(path: Path, ending: str) -> Path:

@@ -33,18 +33,14 @@ from cfx.plugin import (
     NameColumn,
     PairSet,
     Settings,
-    Statement,
     Table,
     Tracks,
-    changes,
     extract_pairs,
     joined,
-    next_in_lane,
     read_table,
-    remarks_of,
-    rows_ahead,
+    statements,
     stem,
-    vehicles_apart,
+    tracks,
 )
 
 FOOT = 0.3048
@@ -221,7 +217,7 @@ class Rows(Tracks):
 
     def _since_and_until(self) -> tuple[Ints, Ints]:
         """Returns frames since the first and until the last row of each row's vehicle, `(N,)`."""
-        starts = np.flatnonzero(changes(self.recording, self.vehicle))
+        starts = np.flatnonzero(tracks.changes(self.recording, self.vehicle))
         sizes = np.diff(np.append(starts, len(self)))
         first = np.repeat(self.frame[starts], sizes)
         last = np.repeat(self.frame[starts + sizes - 1], sizes)
@@ -257,29 +253,35 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     ordered = {name: values[order] for name, values in columns.items()}
     rows = _rows(str(path), names, places, recording[order], ordered, count, dropped)
     _check_units(rows)
-    rows = vehicles_apart(rows)
-    return replace(rows, remarks=(*rows.remarks, *remarks_of(_said_twice(rows, ordered))))
+    rows = tracks.vehicles_apart(rows)
+    return replace(
+        rows, remarks=(*rows.remarks, *statements.remarks_of(_said_twice(rows, ordered)))
+    )
 
 
-def _said_twice(rows: Rows, columns: Mapping[str, Floats]) -> Iterator[Statement]:
+def _said_twice(rows: Rows, columns: Mapping[str, Floats]) -> Iterator[statements.Statement]:
     """Yields what columns of a file say that follows from others too, in the file's units."""
-    ahead, has_row = rows_ahead(rows)
+    ahead, has_row = tracks.rows_ahead(rows)
     headway = np.where(has_row, rows.position[ahead] - rows.position, np.nan) / FOOT
     # In the opposite direction of an arterial Local_Y decreases, and who is next is behind.
     headway[headway < 0] = np.nan
-    following, is_there = next_in_lane(rows)
+    following, is_there = tracks.next_in_lane(rows)
     to_next = np.where(is_there, rows.position[following] - rows.position, np.nan) / FOOT
     basis = "Local_Y and Lane_ID, by which another vehicle is the next ahead"
-    yield Statement("the distance to the Preceding", headway, [to_next], basis)
+    yield statements.Statement("the distance to the Preceding", headway, [to_next], basis)
     said = columns.get("Space_Headway")
     if said is None:
         return
-    yield Statement("Space_Headway", said, [headway], "Local_Y of a vehicle and its Preceding")
+    yield statements.Statement(
+        "Space_Headway", said, [headway], "Local_Y of a vehicle and its Preceding"
+    )
     time_headway = columns.get("Time_Headway")
     if time_headway is not None:
         moves = (columns["v_Vel"] > 0) & (time_headway < _NO_TIME_HEADWAY)
         speed = np.where(moves, columns["v_Vel"], np.nan)
-        yield Statement("Time_Headway", time_headway, [said / speed], "Space_Headway and v_Vel")
+        yield statements.Statement(
+            "Time_Headway", time_headway, [said / speed], "Space_Headway and v_Vel"
+        )
 
 
 def _rows(
@@ -392,7 +394,9 @@ def _sorted(
         DataError: a vehicle has two different rows at a frame.
     """
     order = np.lexsort((columns["Frame_ID"], columns["Vehicle_ID"], recording))
-    is_same = ~changes(recording[order], columns["Vehicle_ID"][order], columns["Frame_ID"][order])
+    is_same = ~tracks.changes(
+        recording[order], columns["Vehicle_ID"][order], columns["Frame_ID"][order]
+    )
     again = np.flatnonzero(is_same)
     before, after = order[again - 1], order[again]
     differs = np.zeros(len(again), dtype=bool)

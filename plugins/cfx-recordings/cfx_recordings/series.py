@@ -9,23 +9,7 @@ from typing import Any
 import numpy as np
 
 from cfx.errors import DataError
-from cfx.plugin import (
-    SINGLE_FRAME,
-    Dropped,
-    Floats,
-    Ints,
-    Marks,
-    Pair,
-    PairSet,
-    Remark,
-    accelerations,
-    count_reasons,
-    distance_driven,
-    first_that_holds,
-    runs,
-    totals_by_reason,
-    unique_name,
-)
+from cfx.plugin import Dropped, Floats, Ints, Pair, PairSet, Remark, tracks
 
 _STEP_ROOM = 0.05
 """How far the typical step between times may be from the layout's, as a share of it."""
@@ -91,19 +75,23 @@ def pairs_of(
         is_good = ~np.any(list(reasons.values()), axis=0)
         good = np.flatnonzero(is_good)
         labels = [values[good] for values in one.labels.values()]
-        starts, sizes = runs(one.frame[good] - np.arange(len(good)), *labels)
+        starts, sizes = tracks.runs(one.frame[good] - np.arange(len(good)), *labels)
         is_pair = sizes > 1
-        lost += count_reasons({**reasons, SINGLE_FRAME: sizes < 2}, "rows")
+        lost += tracks.count_reasons({**reasons, tracks.SINGLE_FRAME: sizes < 2}, "rows")
         stops = starts + sizes
-        ends += count_reasons(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
+        ends += tracks.count_reasons(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
         for start, stop in zip(starts[is_pair].tolist(), stops[is_pair].tolist(), strict=True):
             pairs.append(_pair(one, slice(good[start], good[stop - 1] + 1), seen))
     return PairSet(
-        tuple(pairs), source, totals_by_reason(lost), totals_by_reason(ends), tuple(remarks)
+        tuple(pairs),
+        source,
+        tracks.totals_by_reason(lost),
+        tracks.totals_by_reason(ends),
+        tuple(remarks),
     )
 
 
-def _left_out(one: Series, max_gap: float | None) -> dict[str, Marks]:
+def _left_out(one: Series, max_gap: float | None) -> dict[str, tracks.Marks]:
     """Returns the frames that belong to no pair, by the first reason that holds."""
     values = list(one.signals.values())
     if one.gap is None:
@@ -116,29 +104,29 @@ def _left_out(one: Series, max_gap: float | None) -> dict[str, Marks]:
     furthest = np.inf
     if max_gap is not None:
         furthest = max_gap
-    reasons: dict[str, Marks] = {
+    reasons: dict[str, tracks.Marks] = {
         "a value is missing": np.isnan(np.sum(values, axis=0)),
         "a speed is negative": slowest < 0,
         "the leader is behind its follower (gap of 0 or less)": gap <= 0,
         f"the leader is farther than {furthest:g} m": gap > furthest,
     }
-    return first_that_holds(reasons)
+    return tracks.first_that_holds(reasons)
 
 
-def _ends(one: Series, reasons: Mapping[str, Marks], last: Ints) -> dict[str, Marks]:
+def _ends(one: Series, reasons: Mapping[str, tracks.Marks], last: Ints) -> dict[str, tracks.Marks]:
     """Returns why each pair ends, by reason.
 
     Args:
         last: index of each pair's last frame.
     """
     after = np.minimum(last + 1, len(one.frame) - 1)
-    found: dict[str, Marks] = {"the source's pair ends": last + 1 == len(one.frame)}
+    found: dict[str, tracks.Marks] = {"the source's pair ends": last + 1 == len(one.frame)}
     found["frames are missing"] = one.frame[after] != one.frame[last] + 1
     for reason, holds in reasons.items():
         found[reason] = holds[after]
     for label, values in one.labels.items():
         found[f"the {label.replace('_', ' ')} changes"] = values[after] != values[last]
-    return first_that_holds(found)
+    return tracks.first_that_holds(found)
 
 
 def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
@@ -149,12 +137,12 @@ def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
     if one.gap is not None:
         leader = signals.get("leader_position")
         if leader is None:
-            leader = distance_driven(signals["leader_speed"], one.dt) + one.leader_length
+            leader = tracks.distance_driven(signals["leader_speed"], one.dt) + one.leader_length
         signals["leader_position"] = leader
         signals["follower_position"] = leader - one.leader_length - one.gap[run]
     for who in ("leader", "follower"):
         if f"{who}_acceleration" not in signals:
-            signals[f"{who}_acceleration"] = accelerations(signals[f"{who}_speed"], one.dt)
+            signals[f"{who}_acceleration"] = tracks.accelerations(signals[f"{who}_speed"], one.dt)
     kind = 0
     if "driver_type" in one.labels:
         kind = int(one.labels["driver_type"][run.start])
@@ -162,7 +150,7 @@ def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
     if "lane" in one.labels:
         lane = int(one.labels["lane"][run.start])
     return Pair(
-        pair_id=unique_name(one.name, seen),
+        pair_id=tracks.unique_name(one.name, seen),
         recording=one.recording,
         leader_id=one.leader_id,
         follower_id=one.follower_id,

@@ -25,13 +25,12 @@ from cfx.plugin import (
     Layout,
     PairSet,
     Settings,
-    Statement,
     Table,
-    changes,
     joined,
     read_table,
-    remarks_of,
+    statements,
     stem,
+    tracks,
 )
 from cfx_recordings.series import Series, frames_at, pairs_of
 
@@ -108,19 +107,19 @@ def _pairs(file: Table) -> PairSet:
     numbers = file.numbers
     keys = [numbers[name] for name in ("leader_id", "follower_id", "segment_id")]
     order = np.lexsort((numbers[_TIME], *keys))
-    starts = np.flatnonzero(changes(*[key[order] for key in keys]))
+    starts = np.flatnonzero(tracks.changes(*[key[order] for key in keys]))
     series = []
     for rows in np.split(order, starts[1:]):
         one = _series(file, {name: values[rows] for name, values in numbers.items()})
         if one is not None:
             series.append(one)
-    statements = []
+    said = []
     for name in _OTHER_SPEEDS:
         if name in numbers:
-            statements.append(
-                Statement(name, numbers[name], [numbers["filter_speed"]], "its speed")
+            said.append(
+                statements.Statement(name, numbers[name], [numbers["filter_speed"]], "its speed")
             )
-    return pairs_of(series, file.source, remarks=remarks_of(statements))
+    return pairs_of(series, file.source, remarks=statements.remarks_of(said))
 
 
 def _series(file: Table, rows: Mapping[str, Floats]) -> Series | None:

@@ -77,7 +77,7 @@ def report(
         DataError, TrackingError: the jobs cannot be read.
         OutputError: the page cannot be written.
     """
-    from cfx.plugin import plural
+    from cfx.plugin import wording
     from cfx_report.page import write_report
     from cfx_report.paper import FORMS, write_table
     from cfx_report.runs import read_runs
@@ -99,4 +99,4 @@ def report(
         left_out = f"; {len(found.unfinished)} unfinished ones are named in it"
     elif found.unfinished:
         left_out = f"; {len(found.unfinished)} unfinished ones are not in it"
-    return [f"{kind} of {plural(len(found.jobs), 'job')}{left_out}: {path.absolute()}"]
+    return [f"{kind} of {wording.plural(len(found.jobs), 'job')}{left_out}: {path.absolute()}"]

@@ -18,7 +18,7 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cfx.plugin import FIGURE_METADATA, WIDTH, figure_style, hover_text
+from cfx.plugin import canvas, drawing
 
 _MANY_POINTS = 400
 """A cloud of more points is a picture inside a page's SVG: each point would be an element."""
@@ -39,10 +39,13 @@ def inline_svg(figure: Figure) -> str:
     """
     hovers = _prepare(figure)
     stream = io.StringIO()
-    with figure_style(), mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.3}):
+    with (
+        canvas.figure_style(),
+        mpl.rc_context({"svg.fonttype": "none", "path.simplify_threshold": 0.3}),
+    ):
         # `savefig` would draw twice, once for the layout alone.
         paper = FigureCanvasSVG(figure)
-        paper.print_svg(stream, metadata=FIGURE_METADATA["svg"])  # type: ignore[no-untyped-call]
+        paper.print_svg(stream, metadata=drawing.FIGURE_METADATA["svg"])  # type: ignore[no-untyped-call]
     text = stream.getvalue()
     text = text[text.index("<svg") :]
     for pattern in (
@@ -62,7 +65,7 @@ def inline_svg(figure: Figure) -> str:
     )
     text = re.sub(r"(href=\"|url\()#", lambda found: f"{found[1]}#{PLACE}", text)
     # As wide as its paper, beside others that take the page's whole width.
-    wide = f"max-width: {100 * figure.get_size_inches()[0] / WIDTH:.0f}%"
+    wide = f"max-width: {100 * figure.get_size_inches()[0] / canvas.WIDTH:.0f}%"
     head = rf'<svg \1 aria-hidden="true" style="{wide}">'
     return re.sub(r'<svg [^>]*(viewBox="[^"]*")[^>]*>', head, text, count=1)
 
@@ -71,7 +74,7 @@ def _prepare(figure: Figure) -> list[str]:
     """Turns clouds into pictures and marks what the mouse says something of; returns the texts."""
     hovers: list[str] = []
     for artist in figure.findobj(Artist):
-        text = hover_text(artist)
+        text = canvas.hover_text(artist)
         if text:
             artist.set_gid(f"hover-{len(hovers)}")
             hovers.append(html.escape(text))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from cfx.plugin import TEST, MetricInfo, Purpose, Result, pretty_unit
+from cfx.plugin import MetricInfo, Purpose, Result, wording
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ def are_calibrations(jobs: Iterable[Result]) -> bool:
     return all(job.purpose is Purpose.CALIBRATION for job in jobs)
 
 
-def any_baselines(jobs: Iterable[Result], scope: str = TEST) -> list[str]:
+def any_baselines(jobs: Iterable[Result], scope: str = wording.TEST) -> list[str]:
     """Returns what the policy of any of the jobs is compared with, in the order of the jobs."""
     found: dict[str, None] = {}
     for job in jobs:
@@ -42,7 +42,9 @@ def any_baselines(jobs: Iterable[Result], scope: str = TEST) -> list[str]:
     return list(found)
 
 
-def any_has_metric(jobs: Iterable[Result], name: str, method: str, scope: str = TEST) -> bool:
+def any_has_metric(
+    jobs: Iterable[Result], name: str, method: str, scope: str = wording.TEST
+) -> bool:
     """Says whether any of the jobs has measured a metric."""
     return any(job.has_metric(name, method, scope) for job in jobs)
 
@@ -50,4 +52,4 @@ def any_has_metric(jobs: Iterable[Result], name: str, method: str, scope: str = 
 def metric_title(metric: MetricInfo) -> str:
     """Returns a heading with the unit: "RMSE speed (m/s)"."""
     heading = metric.heading[:1].upper() + metric.heading[1:]
-    return f"{heading} ({pretty_unit(metric.unit)})" if metric.unit else heading
+    return f"{heading} ({wording.pretty_unit(metric.unit)})" if metric.unit else heading

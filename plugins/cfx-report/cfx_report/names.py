@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cfx.errors import ConfigError
-from cfx.plugin import Purpose, Result, common_prefix, flatten
+from cfx.plugin import Purpose, Result, flatten, wording
 from cfx_report.jobs import any_baselines
 
 GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")
@@ -125,7 +125,7 @@ def _said(key: str, flat: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns a setting of each job in words; long values without what they all begin with."""
     values = [str(one[key]) if key in one else "" for one in flat]
     longest = max(map(len, values))
-    same = common_prefix([value for value in values if value])
+    same = wording.common_prefix([value for value in values if value])
     said = []
     if longest > _LONG and same:
         values = [value and f"…{value.removeprefix(same)}" for value in values]

@@ -12,23 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from cfx.plugin import (
-    CLUSTER_COLOURS,
-    CLUSTERS,
-    COLOURS,
-    Purpose,
-    Result,
-    draw_figure,
-    explained,
-    few_drivers,
-    figure_named,
-    installed,
-    percent,
-    plural,
-    short_label,
-    summaries_disagree,
-    write_output,
-)
+from cfx.plugin import Purpose, Result, colours, drawing, files, headline, registry, style, wording
 from cfx_report.inline import inline_scripts, security_policy
 from cfx_report.jobs import Runs, of_purpose
 from cfx_report.names import Row, rows_over_seeds
@@ -53,7 +37,7 @@ def write_report(runs: Runs, output: Path, title: str | None = None) -> Path:
     Raises:
         OutputError: the page cannot be written.
     """
-    write_output(output, render(runs, title), "the report")
+    files.write_output(output, render(runs, title), "the report")
     return output
 
 
@@ -63,7 +47,7 @@ def render(runs: Runs, title: str | None = None) -> str:
 
     environment = _environment(runs)
     sections = []
-    for one in installed("section"):
+    for one in registry.installed("section"):
         body = one.attempt(lambda section: _section(environment, section, runs), "")
         if body.strip():
             sections.append((one.name, one.component, Markup(body)))  # noqa: S704 - a template's
@@ -96,7 +80,7 @@ def _environment(runs: Runs) -> Environment:
 
     environment.globals |= {
         "drawn": functools.partial(_drawn, environment),
-        "caption": lambda name: figure_named(name).component.caption,
+        "caption": lambda name: drawing.figure_named(name).component.caption,
         "lacking": lambda file, what: lacking(runs.jobs, file, what),
         "most": MOST,
         "next_number": itertools.count(1).__next__,
@@ -109,12 +93,12 @@ def _environment(runs: Runs) -> Environment:
 
 def _drawn(environment: Environment, name: str, job: Result) -> Any:
     """Returns the figure of a name as the job has written it; "" if the job lacks its data."""
-    found = figure_named(name)
-    drawing = draw_figure(found, job)
-    if drawing is None:
+    found = drawing.figure_named(name)
+    drawn = drawing.draw_figure(found, job)
+    if drawn is None:
         return ""
     figure: Any = environment.globals["figure"]
-    return figure({"": View(drawing)}, found.component.title)
+    return figure({"": View(drawn)}, found.component.title)
 
 
 def _section(environment: Environment, section: Section, runs: Runs) -> str:
@@ -153,7 +137,10 @@ def _placed(svg: str, place: str) -> Any:
 def _colours() -> str:
     """Returns the style rules for the dots of methods and clusters."""
     rules = ""
-    for name, colour in [*COLOURS.items(), *zip(CLUSTERS, CLUSTER_COLOURS, strict=True)]:
+    for name, colour in [
+        *colours.COLOURS.items(),
+        *zip(style.CLUSTERS, colours.CLUSTER_COLOURS, strict=True),
+    ]:
         rules += f'\n[data-colour="{name}"]::before {{ background: {colour}; }}'
     return rules
 
@@ -166,7 +153,7 @@ def summary(jobs: Sequence[Result]) -> list[str]:
     """Returns sentences: against driver-specific calibration, and against pooled calibration."""
     first = (
         f"{_amount(jobs)}: is a policy that adapts the parameters closer to the real driver than"
-        f" {explained('fixed')}?"
+        f" {wording.explained('fixed')}?"
     )
     compared = of_purpose(jobs, Purpose.ADAPTATION)
     warnings = _few(compared)
@@ -189,7 +176,7 @@ def _few(jobs: Sequence[Result]) -> list[str]:
     if not jobs:
         return []
     fewest = min(job.pairs["driver"].nunique() for job in jobs)
-    warning = few_drivers(fewest)
+    warning = wording.few_drivers(fewest)
     return [warning] if warning else []
 
 
@@ -200,7 +187,10 @@ def _counts(jobs: Sequence[Result]) -> str:
         ("fixed", f"Of {len(jobs)} jobs"),
         ("population", "against pooled calibration"),
     ):
-        sides = [_side(job, baseline) for job in jobs if baseline in job.baselines()]
+        sides = []
+        for job in jobs:
+            if baseline in job.baselines():
+                sides.append(_side(job, baseline))
         if sides:
             counts = ", ".join(
                 f"{side} in {sides.count(side)}" for side in ("yes", "no", "undecided")
@@ -211,15 +201,18 @@ def _counts(jobs: Sequence[Result]) -> str:
 
 def _best(jobs: Sequence[Result]) -> str:
     """Says which job improves most, or which jobs over their seeds: no lucky seed is picked."""
-    rows = [row for row in rows_over_seeds(jobs) if of_purpose(row.jobs, Purpose.ADAPTATION)]
+    rows = []
+    for row in rows_over_seeds(jobs):
+        if of_purpose(row.jobs, Purpose.ADAPTATION):
+            rows.append(row)
     best = max(rows, key=_mean_for_ranking)
     if len(best.jobs) == 1:
         return f"The best: {_verdict(best.jobs[0])}"
     gains = best.improvements("geometric", "fixed")
-    least, most = (percent(float(end), 1) for end in (np.nanmin(gains), np.nanmax(gains)))
+    least, most = (wording.percent(float(end), 1) for end in (np.nanmin(gains), np.nanmax(gains)))
     return (
         f"The best mean over seeds: {best.name}. Improvement of the RMSE of speed:"
-        f" {percent(float(np.nanmean(gains)), 1)} on average ({least} to {most} in"
+        f" {wording.percent(float(np.nanmean(gains)), 1)} on average ({least} to {most} in"
         f" {len(best.jobs)} seeds)."
     )
 
@@ -245,7 +238,7 @@ def _calibration(job: Result) -> str:
     for method in job.methods:
         error = job.metric("rmse_speed", method)
         if method != "policy" and np.isfinite(error):
-            errors.append(f"{short_label(method)} {error:.3f}")
+            errors.append(f"{wording.short_label(method)} {error:.3f}")
     return (
         f"{job.name}: a calibration; its parameters stay constant. RMSE of speed (m/s):"
         f" {', '.join(errors)}."
@@ -262,7 +255,7 @@ def _amount(jobs: Sequence[Result]) -> str:
         for pair in job.pairs["pair_id"].unique():
             pairs.add((source, pair))
     where = f" from {Path(next(iter(sources))).name}" if len(sources) == 1 else ""
-    return f"{plural(len(pairs), 'pair')} of leader and follower{where}"
+    return f"{wording.plural(len(pairs), 'pair')} of leader and follower{where}"
 
 
 def _side(job: Result, baseline: str = "fixed") -> str:
@@ -288,7 +281,7 @@ def _gain(job: Result, baseline: str) -> str:
         return "not defined"
     sure = "no interval for a single driver"
     if np.isfinite(low):
-        sure = f"95 % interval {percent(low, 1)} to {percent(high, 1)}"
-    said = f"{percent(improvement.geometric, 1)} ({sure})"
-    note = summaries_disagree(improvement.geometric, improvement.ratio_of_means)
+        sure = f"95 % interval {wording.percent(low, 1)} to {wording.percent(high, 1)}"
+    said = f"{wording.percent(improvement.geometric, 1)} ({sure})"
+    note = headline.summaries_disagree(improvement.geometric, improvement.ratio_of_means)
     return f"{said}, {note}" if note else said

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from cfx.plugin import NEARLY_BEST, Purpose, Result, short_label, without_folders, write_output
+from cfx.plugin import Purpose, Result, files, identifiability, job_folder, wording
 from cfx_report.jobs import Runs
 from cfx_report.names import Row, any_adapts, baselines_of, methods_of, rows_of
 from cfx_report.sections.calibration import sheet, slices_of, spreads_of
@@ -50,7 +50,7 @@ def write_table(runs: Runs, output: Path, form: str, group_by: str | None = None
     """
     rows = rows_of(runs.jobs, group_by)
     text = latex(rows) if form == "latex" else frame(rows).to_csv(index=False)
-    write_output(output, text, "the table")
+    files.write_output(output, text, "the table")
     return output
 
 
@@ -90,11 +90,11 @@ def latex(rows: Sequence[Row]) -> str:
             line["jobs"] = str(len(row.jobs))
         line["drivers"] = str(_amounts(row)["drivers"])
         for method in methods_of(rows):
-            line[short_label(method)] = _text(row.values("rmse_speed", method))
+            line[wording.short_label(method)] = _text(row.values("rmse_speed", method))
         last = methods_of(rows)[-1]
-        line[f"gap, {short_label(last)} [m]"] = _text(row.values("rmse_gap", last), 2)
+        line[f"gap, {wording.short_label(last)} [m]"] = _text(row.values("rmse_gap", last), 2)
         for baseline in baselines_of(rows):
-            line[f"over {short_label(baseline)}"] = _improvement(row, baseline)
+            line[f"over {wording.short_label(baseline)}"] = _improvement(row, baseline)
         cells.append(line)
     caption = "RMSE of speed [m/s] by method, in closed loop on the test part of each trajectory"
     if any_adapts(rows):
@@ -144,8 +144,8 @@ def _parameter_tables(rows: Sequence[Row]) -> Iterator[str]:
         caption = (
             f"Calibrated parameters, {name}: the model's default, the mean of the folds' pooled"
             " parameters, and median and quantiles of the driver-specific ones. Flat: the loss is"
-            f" within {100 * NEARLY_BEST:.0f} \\% of a driver's best, on so much of the range"
-            " (median over pairs), and for so many pairs on all of it."
+            f" within {100 * identifiability.NEARLY_BEST:.0f} \\% of a driver's best, on so much of"
+            " the range (median over pairs), and for so many pairs on all of it."
         )
         label = re.sub(r"\W+", "-", row.name).strip("-")
         yield _latex_table(table, caption, f"tab:cfx-parameters-{label}")
@@ -197,4 +197,4 @@ def _command(job: Result) -> str:
     if job.overrides is None:
         return "not known"
     typed = " ".join(("python -m cfx", *job.overrides))
-    return without_folders(typed)
+    return job_folder.without_folders(typed)

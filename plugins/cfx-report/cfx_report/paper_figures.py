@@ -101,39 +101,43 @@ def draw(
         DataError, TrackingError: the jobs cannot be read.
         OutputError: a file cannot be written.
     """
-    from cfx.plugin import Paper, installed, on_paper, plural, write_figures
+    from cfx.plugin import canvas, drawing, registry, wording
     from cfx_report.runs import read_runs
 
-    known = sorted(one.name for one in installed("figure"))
-    names = None if only is None else _words(only, "--only", known)
+    figures = {figure.name: figure for figure in registry.installed("figure")}
+    if only is not None:
+        figures = {name: figures[name] for name in _words(only, "--only", sorted(figures))}
     jobs = read_runs(runs).jobs
     said = []
-    with on_paper(Paper(width_mm / 25.4, font_size)):
+    with canvas.on_paper(canvas.Paper(width_mm / 25.4, font_size)):
         for job in jobs:
             own = Path(job.place) / "figures"
             if folder is not None or not Path(job.place).is_dir():
                 own = Path(folder or "figures").expanduser()
                 if len(jobs) > 1:
                     own /= job.name
-            paths = write_figures(own, job, formats=formats, names=names)
-            said.append(f"{plural(len(paths), 'file')} in {own.absolute()}")
-        if len(jobs) > 1 and names is None:
+            paths = drawing.write_figures(own, job, figures.values(), formats=formats)
+            said.append(f"{wording.plural(len(paths), 'file')} in {own.absolute()}")
+        if len(jobs) > 1 and only is None:
             said += _compared(jobs, Path(folder or "figures").expanduser(), formats)
     return said
 
 
 def _compared(jobs: Sequence[Result], folder: Path, formats: Sequence[str]) -> list[str]:
     """Draws jobs against the one that is closest to the drivers; returns what to tell the user."""
-    from cfx.plugin import ranking_of, verdict, write_figure
+    from cfx.plugin import drawing, statistics
     from cfx_report.figures.models import draw_models
 
     errors = {job.name: job.errors for job in jobs}
-    ranking = ranking_of(errors)
+    ranking = statistics.ranking_of(errors)
     if not ranking.against:
         return ["The jobs share no pairs on the same frames, so that they are not compared."]
     figure = draw_models(errors, ranking.against)
-    paths = [write_figure(figure, folder / f"models.{form}") for form in formats]
-    return [verdict(ranking), *[f"Model against model: {path.absolute()}" for path in paths]]
+    paths = [drawing.write_figure(figure, folder / f"models.{form}") for form in formats]
+    return [
+        statistics.verdict(ranking),
+        *[f"Model against model: {path.absolute()}" for path in paths],
+    ]
 
 
 def _width_mm(text: str) -> float:

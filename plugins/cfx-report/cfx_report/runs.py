@@ -11,16 +11,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from cfx.errors import DataError, without_passwords
-from cfx.plugin import (
-    Origin,
-    Result,
-    is_url,
-    local_folder,
-    optional,
-    read_json,
-    read_result,
-    tracking_of_run,
-)
+from cfx.plugin import Origin, Result, job_folder, read_result, storage, tracking_of_run
 from cfx_report.jobs import Runs, Unfinished
 from cfx_report.names import named
 
@@ -61,8 +52,8 @@ def read_runs(runs: Sequence[str]) -> Runs:
 
 def _read(run: str) -> list[Result | Unfinished]:
     """Returns the jobs that one word on the command line stands for."""
-    if is_url(run):
-        copy = local_folder(run)
+    if storage.is_url(run):
+        copy = storage.local_folder(run)
         return _of_folder(
             copy, lambda job: f"{run.rstrip('/')}/{job.relative_to(copy)}".removesuffix("/.")
         )
@@ -122,7 +113,7 @@ def _job_folders(folder: Path) -> Iterator[Path]:
 def _one(folder: Path, place: str) -> Result | Unfinished:
     if (folder / "metrics.json").is_file():
         return read_result(Origin(place, folder))
-    status = optional(folder / "outcome.json", read_json) or {}
+    status = job_folder.optional(folder / "outcome.json", job_folder.read_json) or {}
     if status.get("code"):
         return Unfinished(place, f"failed: {without_passwords(str(status.get('message', '')))}")
     return Unfinished(place, "not finished: it has no metrics.json")

@@ -12,24 +12,11 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, TypeVar
 
-from cfx.plugin import (
-    MINUS,
-    NOTHING,
-    Component,
-    Kind,
-    Result,
-    add_kind,
-    explained,
-    percent,
-    short_label,
-)
+from cfx.plugin import Component, Result, wording
 from cfx_report.jobs import Runs
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-
-add_kind(Kind("section", "cfx_report.section:Section", chosen=False))
 
 
 @dataclass(frozen=True)
@@ -110,7 +97,10 @@ def lacking(jobs: tuple[Result, ...], file: str, what: str) -> str:
         file: its name.
         what: what cannot be shown without it.
     """
-    without = [job.name for job in jobs if file in job.missing]
+    without = []
+    for job in jobs:
+        if file in job.missing:
+            without.append(job.name)
     if not without:
         return ""
     reason = "an older version of cfx wrote it, or the file was removed"
@@ -193,7 +183,7 @@ class Sheet:
 
 def text(value: object) -> Cell:
     """Returns a cell with a text, sorted as one."""
-    return Cell(str(value) or NOTHING)
+    return Cell(str(value) or wording.NOTHING)
 
 
 def number(value: float, form: str, second: str = "") -> Cell:
@@ -205,27 +195,27 @@ def number(value: float, form: str, second: str = "") -> Cell:
         second: a smaller line below.
     """
     if not math.isfinite(value):
-        return Cell(NOTHING, number=True, second=second)
+        return Cell(wording.NOTHING, number=True, second=second)
     return Cell(formatted(value, form), repr(float(value)), number=True, second=second)
 
 
 def formatted(value: float, form: str) -> str:
     """Returns a number in a format such as ".2f" or "+.0%", with a real minus sign."""
     if not math.isfinite(value):
-        return NOTHING
-    return f"{value:{form}}".replace("%", " %").replace("-", MINUS)
+        return wording.NOTHING
+    return f"{value:{form}}".replace("%", " %").replace("-", wording.MINUS)
 
 
 def interval(low: float, high: float) -> Cell:
     """Returns a cell with an interval of signed percentages, sorted by its lower end."""
     if not (math.isfinite(low) and math.isfinite(high)):
-        return Cell(NOTHING, number=True)
-    return Cell(f"{percent(low, 1)} to {percent(high, 1)}", repr(low), number=True)
+        return Cell(wording.NOTHING, number=True)
+    return Cell(f"{wording.percent(low, 1)} to {wording.percent(high, 1)}", repr(low), number=True)
 
 
 def method_cell(method: str) -> Cell:
     """Returns a cell that names a method in its colour."""
-    return Cell(short_label(method), colour=method)
+    return Cell(wording.short_label(method), colour=method)
 
 
 def tested(jobs: Iterable[Result]) -> str:
@@ -241,7 +231,10 @@ def tested(jobs: Iterable[Result]) -> str:
 
 def methods_explained(methods: Iterable[str]) -> str:
     """Returns what each method is, as one sentence."""
-    parts = [f"{short_label(method)}: {explained(method)}" for method in dict.fromkeys(methods)]
+    parts = [
+        f"{wording.short_label(method)}: {wording.explained(method)}"
+        for method in dict.fromkeys(methods)
+    ]
     return f"{'; '.join(parts)}."
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from cfx.core.registry import Installed, installed
-from cfx.figures.canvas import canvas
+from cfx.figures.canvas import blank
 from cfx_report import page
 from cfx_report.jobs import Runs
 from cfx_report.runs import read_runs
@@ -41,7 +41,7 @@ class Further(Section):
             Column[float]("a heading", lambda row: f"row {row:g}", "explained so", "above"),
             Column("half", lambda row: number(row / 2, "+.1f", "second line")),
         )
-        views = {"one": View(canvas(1.0), "a note"), "another": View(canvas(1.0))}
+        views = {"one": View(blank(1.0), "a note"), "another": View(blank(1.0))}
         return {"words": HOSTILE, "sheet": Sheet.of(columns, [1.0, float("nan")]), "views": views}
 
 

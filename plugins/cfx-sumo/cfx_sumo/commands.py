@@ -104,14 +104,14 @@ def _drive(options: argparse.Namespace) -> None:
     # without.
     # None is Python's own way to say that a module is not there.
     sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
-    from cfx.plugin import console_logging
+    from cfx.plugin import console
     from cfx_sumo.drive.run import parse_drivers, report, run_scenario
     from cfx_sumo.drive.scenarios import SCENARIOS
 
     output = None
     if options.output:
         output = Path(options.output).expanduser()
-    with console_logging():
+    with console.console_logging():
         runs = parse_drivers(options.drivers)
         if options.scenario == "stress":
             from cfx_sumo.drive.stress import report_stress, run_stress

@@ -17,17 +17,15 @@ from torch import Tensor
 from cfx.errors import ConfigError, DataError, listed
 from cfx.plugin import (
     COARSE_S,
-    FLAT_SHARE_PREFIX,
     DrivingModel,
     ExportFormat,
     InSumo,
     VType,
-    create,
-    examine,
+    files,
     folder_of,
-    parse_json,
-    parse_yaml,
-    write_output,
+    identifiability,
+    job_folder,
+    registry,
 )
 from cfx_sumo.limits import lost_limits
 
@@ -91,7 +89,7 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     if drawn is not None:
         new, _ = vtypes(node, drawn)
         lines += _distribution(POPULATION, drawn, new, _columns(new, len(drawn)))
-    write_output(path, _xml(lines, notes), "the list of vTypes")
+    files.write_output(path, _xml(lines, notes), "the list of vTypes")
     first = quoteattr(str(table["cluster"].iloc[0]))
     counts = []
     for name, count in table.groupby("cluster", sort=False).size().items():
@@ -120,9 +118,12 @@ def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[st
         ConfigError: SUMO has no model that drives as this one.
         DataError: the table has other parameters than the model.
     """
-    model = cast(DrivingModel, create("model", node))
+    model = cast(DrivingModel, registry.create("model", node))
     columns = [f"parameter_{name}" for name in model.space.names]
-    missing = [column for column in columns if column not in table]
+    missing = []
+    for column in columns:
+        if column not in table:
+            missing.append(column)
     if missing:
         raise DataError(
             f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the"
@@ -163,7 +164,7 @@ def _krauss(node: Mapping[str, Any], p: Mapping[str, Tensor]) -> tuple[DrivingMo
     parameters = dict(node.get("parameters") or {})
     parameters["t_i"] = {"default": 0.0, "tuned": False}
     without_lag = {**node, **_WITHOUT_LAG, "parameters": parameters}
-    return cast(DrivingModel, create("model", without_lag)), notes
+    return cast(DrivingModel, registry.create("model", without_lag)), notes
 
 
 def _folder(run: str | Path) -> tuple[Path, Path]:
@@ -176,9 +177,9 @@ def _folder(run: str | Path) -> tuple[Path, Path]:
 
 def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
     """Reads the model's node, and the rows of `fixed`, calmest cluster first."""
-    examine(folder)
+    job_folder.examine(folder)
     try:
-        node = parse_yaml((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
+        node = job_folder.parse_yaml((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
         if not isinstance(node, dict):
             raise ValueError("config.yaml: model is no mapping")
         table = pd.read_csv(folder / "pairs.csv", dtype={"pair_id": str})
@@ -213,7 +214,7 @@ def _time_step(folder: Path) -> float:
     """Returns the time step in which a job calibrated, s; its policy says so."""
     path = folder / "policy" / "policy.json"
     try:
-        step = float(parse_json(path.read_text(encoding="utf-8"))["dt"])
+        step = float(job_folder.parse_json(path.read_text(encoding="utf-8"))["dt"])
         if not 0 < step < np.inf:
             raise ValueError(f"dt: {step}")
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -238,8 +239,15 @@ def _undetermined(table: pd.DataFrame) -> list[str]:
 
 def _flat(table: pd.DataFrame, row: Any) -> list[str]:
     """Returns the parameters whose loss is flat for the driver of a row, by cfx's names."""
-    columns = [str(name) for name in table if str(name).startswith(FLAT_SHARE_PREFIX)]
-    return [name.removeprefix(FLAT_SHARE_PREFIX) for name in columns if table[name][row] == 1]
+    columns = []
+    for name in table:
+        if str(name).startswith(identifiability.FLAT_SHARE_PREFIX):
+            columns.append(str(name))
+    return [
+        name.removeprefix(identifiability.FLAT_SHARE_PREFIX)
+        for name in columns
+        if table[name][row] == 1
+    ]
 
 
 def _xml(lines: list[str], notes: list[str]) -> str:

@@ -16,24 +16,21 @@ from pydantic import Field
 
 from cfx.errors import DataError, listed
 from cfx.plugin import (
-    NOBODY,
     Dataset,
     FileDatasetSettings,
     FileStart,
     Floats,
     Ints,
-    Marks,
     PairSet,
     Remark,
     Settings,
-    Statement,
     Tracks,
-    count_reasons,
     extract_pairs,
     joined,
-    remarks_of,
     remarks_on_leaders,
+    statements,
     stem,
+    tracks,
 )
 from cfx_sumo.fcd_lanes import Couples, Lanes
 from cfx_sumo.fcd_rows import FcdRows, is_fcd, read_rows
@@ -113,8 +110,8 @@ class SumoFcdDataset(Dataset):
     def read(self) -> PairSet:
         parts = []
         for path in self.settings.files():
-            tracks = _tracks(read_rows(path), self.settings)
-            parts.append(extract_pairs(tracks, max_gap=self.settings.max_gap))
+            vehicles = _tracks(read_rows(path), self.settings)
+            parts.append(extract_pairs(vehicles, max_gap=self.settings.max_gap))
         return joined(parts)
 
 
@@ -159,9 +156,11 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         _warn_of_lengths(rows, types, settings)
     else:
         known = {name: number + 1 for number, name in enumerate(names.tolist())}
-        named = [known.get(name, NOBODY) for name in rows.texts["leaderID"][order].tolist()]
+        named = [known.get(name, tracks.NOBODY) for name in rows.texts["leaderID"][order].tolist()]
         by_name = _Ahead(np.array(named), numbers["leaderGap"][kept], length)
-        remarks = remarks_of(_said_twice(lanes, by_name, numbers["leaderSpeed"][kept], dt))
+        remarks = statements.remarks_of(
+            _said_twice(lanes, by_name, numbers["leaderSpeed"][kept], dt)
+        )
         leader, gap, length = _as_named(lanes, by_name, leader, beside)
         position = lanes.driven(dt)
         number_of_lane = lanes.lane_stints(edges)
@@ -169,7 +168,7 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         "driving against its lane's direction": is_oncoming,
         "parked beside the lane": is_parked,
     }
-    tracks = Tracks(
+    vehicles = Tracks(
         source=str(rows.path),
         dt=dt,
         recordings=(stem(rows.path),),
@@ -187,12 +186,12 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         driver_types=types,
         ids_are_unique=True,
         names=("", *names.tolist()),
-        dropped=(*rows.dropped, *count_reasons(left_out, "rows")),
+        dropped=(*rows.dropped, *tracks.count_reasons(left_out, "rows")),
         remarks=remarks,
     )
     if gap is not None:
-        return tracks
-    return replace(tracks, remarks=(*_missing_of_flows(names), *remarks_on_leaders(tracks)))
+        return vehicles
+    return replace(vehicles, remarks=(*_missing_of_flows(names), *remarks_on_leaders(vehicles)))
 
 
 def _missing_of_flows(names: NDArray[np.str_]) -> tuple[Remark, ...]:
@@ -226,11 +225,13 @@ def _missing_of_flows(names: NDArray[np.str_]) -> tuple[Remark, ...]:
 
 def _said_twice(
     lanes: Lanes, named: _Ahead, leader_speed: Floats, dt: float
-) -> Iterator[Statement]:
+) -> Iterator[statements.Statement]:
     """Yields what SUMO says of leaders that follows from their own rows too."""
     at, is_there = lanes.rows_of(named.leader)
     speed = np.where(is_there, lanes.speed[at], np.nan)
-    yield Statement("leaderSpeed", leader_speed, [speed], "the leader's speed", _ROUNDING)
+    yield statements.Statement(
+        "leaderSpeed", leader_speed, [speed], "the leader's speed", _ROUNDING
+    )
     # Vehicles' lengths are not in the file, so changes are compared, over a second.
     between = np.where(is_there, lanes.position[at] - lanes.position, np.nan)
     later = max(1, round(1.0 / dt))
@@ -244,7 +245,7 @@ def _said_twice(
     said = np.where(same, named.gap[later:] - named.gap[:-later], np.nan)
     follows = np.where(same, between[later:] - between[:-later], np.nan)
     basis = "pos of a vehicle and its leader"
-    yield Statement("the change of leaderGap", said, [follows], basis, 2 * _ROUNDING)
+    yield statements.Statement("the change of leaderGap", said, [follows], basis, 2 * _ROUNDING)
 
 
 def _types(rows: FcdRows) -> tuple[tuple[str, ...], Ints]:
@@ -272,7 +273,7 @@ def _warn_of_lengths(rows: FcdRows, types: tuple[str, ...], settings: SumoFcdSet
         )
 
 
-def _without(couples: Couples, left_out: Marks) -> Couples:
+def _without(couples: Couples, left_out: tracks.Marks) -> Couples:
     """Returns the couples neither of whose rows is left out."""
     kept = ~left_out[couples.passed] & ~left_out[couples.passing]
     return Couples(couples.passed[kept], couples.passing[kept])
@@ -292,7 +293,7 @@ class _Ahead(NamedTuple):
 
 
 def _as_named(
-    lanes: Lanes, named: _Ahead, by_place: Ints, beside: Callable[[Ints, Ints], Marks]
+    lanes: Lanes, named: _Ahead, by_place: Ints, beside: Callable[[Ints, Ints], tracks.Marks]
 ) -> _Ahead:
     """Returns the leaders that SUMO names, and vehicles' lengths as they follow from its gaps.
 
@@ -308,7 +309,7 @@ def _as_named(
     at, _ = lanes.rows_of(leader)
     gap = named.gap.copy()
     gap[wrong] = (lanes.position[at] - length[at] - lanes.position)[wrong]
-    return _Ahead(leader, np.where(leader == NOBODY, np.nan, gap), length)
+    return _Ahead(leader, np.where(leader == tracks.NOBODY, np.nan, gap), length)
 
 
 def _step(rows: FcdRows) -> float:

@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
-from cfx.plugin import NOBODY, Floats, Ints, Marks, changes
+from cfx.plugin import Floats, Ints, tracks
 
 _STANDING_MPS = 0.1
 """m/s: a vehicle below this stands."""
@@ -62,15 +62,15 @@ class Lanes:
     heading: Floats
 
     @property
-    def starts(self) -> Marks:
+    def starts(self) -> tracks.Marks:
         """Where a vehicle's rows begin."""
-        return changes(self.vehicle)
+        return tracks.changes(self.vehicle)
 
     def take(self, index: NDArray[Any]) -> Self:
         """Returns the rows at an index or a mask."""
         return replace(self, **{one.name: getattr(self, one.name)[index] for one in fields(self)})
 
-    def is_followed_up(self) -> Marks:
+    def is_followed_up(self) -> tracks.Marks:
         """Says after which rows the same vehicle goes on in the same lane in the next frame."""
         goes_on = np.zeros(len(self.vehicle), dtype=bool)
         goes_on[:-1] = (
@@ -80,7 +80,7 @@ class Lanes:
         )
         return goes_on
 
-    def is_oncoming(self, dt: float) -> Marks:
+    def is_oncoming(self, dt: float) -> tracks.Marks:
         """Says which rows are of vehicles that drive against their lane's direction.
 
         SUMO's vehicles do while they overtake in the lane of the opposite direction.
@@ -111,20 +111,20 @@ class Lanes:
         passing = np.concatenate([one[overtakes], fourth[overtook]])
         return Couples(passed, passing)
 
-    def is_parked(self, couples: Couples) -> Marks:
+    def is_parked(self, couples: Couples) -> tracks.Marks:
         """Says which rows are of vehicles that are parked beside their lane.
 
         A vehicle is parked from where it comes to a stop until it moves on, if others drive
         through it meanwhile, or if it stands beside where others drive in that lane.
         """
         standing = self.speed < _STANDING_MPS
-        stint = np.cumsum(changes(self.vehicle, self.lane, standing))
+        stint = np.cumsum(tracks.changes(self.vehicle, self.lane, standing))
         is_passed = np.zeros(len(standing), dtype=bool)
         is_passed[couples.passed] = True
         marks = standing & (is_passed | self._is_off_lane(standing))
         return standing & np.isin(stint, stint[marks])
 
-    def _is_off_lane(self, standing: Marks) -> Marks:
+    def _is_off_lane(self, standing: tracks.Marks) -> tracks.Marks:
         """Says which vehicles stand away from where the nearest moving one drives in that lane.
 
         False where `x`, `y` or `heading` is not known.
@@ -145,7 +145,7 @@ class Lanes:
             result[rows] |= is_near & (np.abs(right) > _OFF_LANE_M)
         return result
 
-    def beside(self, couples: Couples, width: float) -> Callable[[Ints, Ints], Marks]:
+    def beside(self, couples: Couples, width: float) -> Callable[[Ints, Ints], tracks.Marks]:
         """Returns what says of rows of two vehicles in one lane whether they drive side by side.
 
         They do where they are `width` or more apart sideways: by `lateral`, or by `x`, `y` and
@@ -195,7 +195,7 @@ class Lanes:
         both: Ints = (self.lane[one] * count + first) * count + second
         return both
 
-    def next_in_lane(self, beside: Callable[[Ints, Ints], Marks]) -> Ints:
+    def next_in_lane(self, beside: Callable[[Ints, Ints], tracks.Marks]) -> Ints:
         """Returns the next vehicle ahead in each row's lane that is not beside, 0 for none."""
         leader = np.zeros(len(self.vehicle), dtype=np.int64)
         is_open = np.ones(len(self.vehicle), dtype=bool)
@@ -222,13 +222,13 @@ class Lanes:
         same &= self.lane[behind] == self.lane[ahead]
         return behind[same], ahead[same]
 
-    def rows_of(self, leader: Ints) -> tuple[Ints, Marks]:
+    def rows_of(self, leader: Ints) -> tuple[Ints, tracks.Marks]:
         """Returns the rows of leaders `(N,)` at each row's frame, and whether there is one."""
         frames = int(self.frame.max()) + 1
         keys = self.vehicle * frames + self.frame
         at = np.minimum(np.searchsorted(keys, leader * frames + self.frame), len(keys) - 1)
         is_there = (self.vehicle[at] == leader) & (self.frame[at] == self.frame)
-        return at, is_there & (leader != NOBODY)
+        return at, is_there & (leader != tracks.NOBODY)
 
     def driven(self, dt: float) -> Floats:
         """Returns the distance that each vehicle has driven since its first row, m.
@@ -239,7 +239,7 @@ class Lanes:
         starts = self.starts
         before = np.append(self.speed[:1], self.speed[:-1])
         euler, ballistic = self.speed * dt, 0.5 * (before + self.speed) * dt
-        within = np.flatnonzero(~changes(self.vehicle, self.lane))
+        within = np.flatnonzero(~tracks.changes(self.vehicle, self.lane))
         moved = self.position[within] - self.position[within - 1]
         steps = euler
         if np.abs(moved - ballistic[within]).sum() < np.abs(moved - euler[within]).sum():
@@ -269,7 +269,7 @@ class Lanes:
         left = (self.position[at] - self.position - gap)[is_known]
         own = leader[is_known]
         order = np.lexsort((left, own))
-        starts = np.flatnonzero(changes(own[order]))
+        starts = np.flatnonzero(tracks.changes(own[order]))
         sizes = np.diff(np.append(starts, len(order)))
         medians = left[order][starts + sizes // 2]
         by_vehicle = np.full(int(self.vehicle.max()) + 1, np.nan)

@@ -24,9 +24,9 @@ from cfx.plugin import (
     Ints,
     Layout,
     Table,
-    count_reasons,
     open_text,
     read_table,
+    tracks,
 )
 
 _BLOCK = 1 << 20
@@ -242,7 +242,7 @@ def _of_table(path: Path) -> FcdRows:
     nothing = np.full(len(table), np.nan)
     numbers = {name: table.numbers.get(name, nothing)[is_vehicle] for name in _NUMBERS}
     texts = {name: _names(table, name)[is_vehicle] for name in _TEXTS}
-    dropped = count_reasons({"a person, or in no lane": is_row & ~is_vehicle}, "rows")
+    dropped = tracks.count_reasons({"a person, or in no lane": is_row & ~is_vehicle}, "rows")
     return FcdRows(path, times, step[is_vehicle], numbers, texts, dropped)
 
 

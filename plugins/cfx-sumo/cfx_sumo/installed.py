@@ -9,7 +9,7 @@ import importlib.metadata
 import re
 
 from cfx.errors import NotInstalledError, SumoError
-from cfx.plugin import install_line
+from cfx.plugin import distributions
 
 DISTRIBUTION = "cfx-sumo"
 """What brings SUMO."""
@@ -29,14 +29,13 @@ def require_sumo() -> str:
     try:
         version = importlib.metadata.version("libsumo")
     except importlib.metadata.PackageNotFoundError:
-        raise NotInstalledError(
-            f"SUMO is not installed; {wanted}, comes with: {install_line(DISTRIBUTION)}"
-        ) from None
+        line = distributions.install_line(DISTRIBUTION)
+        raise NotInstalledError(f"SUMO is not installed; {wanted}, comes with: {line}") from None
     number = re.match(r"(\d+)\.(\d+)", version)
     if number is None or not OLDEST <= (int(number[1]), int(number[2])) < BELOW:
         raise SumoError(
             f"SUMO {version} is installed (the package libsumo), but cfx works with {wanted}:"
-            f" {install_line(DISTRIBUTION)}"
+            f" {distributions.install_line(DISTRIBUTION)}"
         )
     return version
 

@@ -18,8 +18,7 @@ from cfx.plugin import (
     ParameterSpace,
     VType,
     bumper_gap,
-    safe_divisor,
-    safe_sqrt,
+    regimes,
     sumo_speed,
 )
 
@@ -118,13 +117,15 @@ def _safe_speed(room: Tensor, drop: Tensor, tau: Tensor, dt: float) -> Tensor:
     """
     room = room.clamp(min=0.0)
     half = tau / dt - 0.5
-    steps = torch.floor(safe_sqrt(half * half + 2.0 * room / (dt * drop)) - half).clamp(min=0.0)
+    steps = torch.floor(regimes.safe_sqrt(half * half + 2.0 * room / (dt * drop)) - half).clamp(
+        min=0.0
+    )
     return (room + 0.5 * dt * drop * steps * (steps + 1.0)) / (tau + steps * dt)
 
 
 def _emergency(gap: Tensor, v: Tensor, v_l: Tensor, p: Mapping[str, Tensor]) -> Tensor:
     """Returns the deceleration, m/s2, that the situation asks for."""
     decel, open_ = p["decel_leader"], gap > 0
-    first = 0.5 * v * v / safe_divisor(gap + 0.5 * v_l * v_l / decel, open_)
-    second = 0.5 * (v * v - v_l * v_l) / safe_divisor(gap, open_)
+    first = 0.5 * v * v / regimes.safe_divisor(gap + 0.5 * v_l * v_l / decel, open_)
+    second = 0.5 * (v * v - v_l * v_l) / regimes.safe_divisor(gap, open_)
     return torch.where(open_, torch.where(first <= decel, first, second), p["emergencyDecel"])

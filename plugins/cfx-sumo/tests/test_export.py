@@ -29,7 +29,7 @@ CALIBRATED = (
     "data.frames=150",
     "optimizer=random",
     "optimizer.samples=32",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "hydra.run.dir=job",
 )

@@ -37,7 +37,7 @@ QUICK = [
     "optimizer=random",
     "optimizer.samples=12",
     "policy=fixed",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
 ]
 

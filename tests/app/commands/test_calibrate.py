@@ -20,7 +20,7 @@ QUICK = [
     "optimizer.samples=16",
     "calibration.prior=none",
     "tracking.enabled=false",
-    "figures.enabled=false",
+    "figures=none",
 ]
 
 

@@ -46,7 +46,7 @@ QUICK = [
     "data.pairs=6",
     "data.platoon_size=1",
     "data.frames=200",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "calibration.prior=none",
 ]

@@ -34,7 +34,7 @@ QUICK = [
     "data.pairs=16",
     "data.platoon_size=1",
     "data.frames=130",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
 ]
 

@@ -28,7 +28,7 @@ QUICK = [
     "data.max_pairs=null",
     "data.platoon_size=1",
     "data.frames=200",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "calibration.prior=none",
 ]

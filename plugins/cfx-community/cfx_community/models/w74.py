@@ -18,19 +18,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from cfx.plugin import (
-    SPACING_WIDTH,
-    SPEED_WIDTH,
-    DrivingModel,
-    Follower,
-    Leader,
-    Parameter,
-    ParameterSpace,
-    safe_sqrt,
-    switches_exactly,
-    where_below,
-    where_up_to,
-)
+from cfx.plugin import DrivingModel, Follower, Leader, Parameter, ParameterSpace, regimes
 
 _NEAREST_ROOM = 1e-3
 """m: bounds quotients, and their gradients, beside a threshold; the brake cap acts long before."""
@@ -186,7 +174,7 @@ class W74(DrivingModel):
         s = leader.position - follower.position
         closing = v - v_l
         ax = leader.length + p["ax_add"]
-        bx = p["bx_add"] * safe_sqrt(torch.minimum(v, v_l))
+        bx = p["bx_add"] * regimes.safe_sqrt(torch.minimum(v, v_l))
         abx = ax + bx
         sdx = p["sdx_mult"] * abx
         sdv = ((s - ax) / p["cx"]).square()
@@ -204,17 +192,21 @@ class W74(DrivingModel):
         emergency = torch.where(s <= ax, b_min, emergency.clamp(max=0.0))
 
         most = torch.maximum(free, b_null)
-        if not switches_exactly(self.temperature):
+        if not regimes.switches_exactly(self.temperature):
             # They are mixed, so each must be something that the vehicle can do.
             approaching = approaching.maximum(b_min).minimum(most)
             emergency = emergency.maximum(b_min).minimum(most)
         # Nested, not joined by `&`, as in w99: masks of doubles are slow to join.
-        near_by = partial(where_below, scale=SPACING_WIDTH, temperature=self.temperature)
-        slower = partial(where_below, scale=SPEED_WIDTH, temperature=self.temperature)
+        near_by = partial(
+            regimes.where_below, scale=regimes.SPACING_WIDTH, temperature=self.temperature
+        )
+        slower = partial(
+            regimes.where_below, scale=regimes.SPEED_WIDTH, temperature=self.temperature
+        )
         calm = slower(opdv, closing, near_by(s, sdx, following, free), free)
         calm = slower(sdv, closing, approaching, calm)
-        acceleration = where_up_to(
-            s, abx, emergency, calm, scale=SPACING_WIDTH, temperature=self.temperature
+        acceleration = regimes.where_up_to(
+            s, abx, emergency, calm, scale=regimes.SPACING_WIDTH, temperature=self.temperature
         )
         acceleration = torch.maximum(torch.minimum(acceleration, most), b_min)
         return (v + acceleration * dt).clamp(min=0.0)

@@ -24,7 +24,7 @@ from cfx.plugin import (
     SegmentLosses,
     Segments,
     Settings,
-    create,
+    registry,
     squashed,
 )
 from cfx_community.policies.estimator import DrivenModel, EstimatorNetwork, EstimatorPolicy
@@ -80,8 +80,8 @@ class RecalibratePolicy(EstimatorPolicy):
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
-        self._optimizer = cast(Optimizer, create("optimizer", self.settings.optimizer))
-        self._objective = cast(Objective, create("objective", self.settings.objective))
+        self._optimizer = cast(Optimizer, registry.create("optimizer", self.settings.optimizer))
+        self._objective = cast(Objective, registry.create("objective", self.settings.objective))
 
     def estimator(
         self, driven: DrivenModel, prior: Tensor, generator: torch.Generator

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cfx.errors import EngineError, NotInstalledError
-from cfx.plugin import cores, install_line
+from cfx.plugin import distributions, threads
 from cfx_dask.engine.settings import DaskSettings
 
 _WORKERS_ELSEWHERE = 4
@@ -53,7 +53,7 @@ def require_installed(settings: DaskSettings) -> None:
 
 def _require(module: str, what: str, distribution: str) -> None:
     if importlib.util.find_spec(module) is None:
-        line = install_line(distribution)
+        line = distributions.install_line(distribution)
         raise NotInstalledError(f"{what} needs the package {module}: {line}")
 
 
@@ -63,7 +63,7 @@ def workers_of(settings: DaskSettings) -> int:
         return settings.workers
     if settings.cluster in _PACKAGES:
         return _WORKERS_ELSEWHERE
-    return cores()
+    return threads.cores()
 
 
 def start(settings: DaskSettings) -> Any:

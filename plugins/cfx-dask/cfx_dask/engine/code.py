@@ -8,7 +8,7 @@ import importlib.util
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from cfx.plugin import KINDS, OWN, entries
+from cfx.plugin import distributions, registry
 
 
 @functools.cache
@@ -17,9 +17,9 @@ def installed_code() -> Mapping[str, str]:
 
     Nothing is imported.
     """
-    packages: dict[str, set[str]] = {OWN: {"cfx"}}
-    for kind in KINDS:
-        for entry in entries(kind):
+    packages: dict[str, set[str]] = {distributions.OWN: {"cfx"}}
+    for kind in registry.KINDS:
+        for entry in registry.entries(kind):
             packages.setdefault(entry.distribution, set()).add(entry.package)
     return {name: _hash(found) for name, found in packages.items()}
 

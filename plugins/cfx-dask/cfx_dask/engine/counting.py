@@ -5,18 +5,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Generic
 
-from cfx.plugin import ResultT, ShardT, Work
+from cfx.plugin import engine
 
 
 @dataclass(frozen=True)
-class Counted(Generic[ResultT]):
+class Counted(Generic[engine.ResultT]):
     """A result, and the units of work that it took."""
 
-    result: ResultT
+    result: engine.ResultT
     units: int
 
 
-def counted(work: Work[ShardT, ResultT], shard: ShardT) -> Counted[ResultT]:
+def counted(
+    work: engine.Work[engine.ShardT, engine.ResultT], shard: engine.ShardT
+) -> Counted[engine.ResultT]:
     """Does the work of one shard."""
     units = 0
 

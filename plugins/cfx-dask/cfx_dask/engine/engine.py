@@ -9,7 +9,7 @@ from collections.abc import Generator, Iterable
 from contextlib import closing
 from typing import Any, ClassVar
 
-from cfx.plugin import Engine, Report, ResultT, Settings, ShardT, Work
+from cfx.plugin import Engine, Settings, engine
 from cfx_dask.engine.clusters import require_installed
 from cfx_dask.engine.connection import Connection
 from cfx_dask.engine.run import Run
@@ -37,12 +37,12 @@ class DaskEngine(Engine):
 
     def map(
         self,
-        work: Work[ShardT, ResultT],
-        shards: Iterable[ShardT],
-        report: Report,
+        work: engine.Work[engine.ShardT, engine.ResultT],
+        shards: Iterable[engine.ShardT],
+        report: engine.Report,
         *,
         shares_cores: bool = True,
-    ) -> Generator[tuple[int, ResultT], None, None]:
+    ) -> Generator[tuple[int, engine.ResultT], None, None]:
         run = Run(self._connection, self.settings, work, report)
         with closing(run.results(shards)) as results:
             yield from results

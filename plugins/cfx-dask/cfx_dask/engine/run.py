@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Generic
 
 from cfx.errors import EngineError
-from cfx.plugin import Report, ResultT, ShardT, Work
+from cfx.plugin import engine
 from cfx_dask.engine.code import installed_code
 from cfx_dask.engine.connection import Connection
 from cfx_dask.engine.settings import DaskSettings
@@ -24,7 +24,7 @@ _POLL_S = 1.0
 
 
 @dataclass
-class _Attempt(Generic[ShardT]):
+class _Attempt(Generic[engine.ShardT]):
     """A shard that is being worked on.
 
     Attributes:
@@ -34,12 +34,12 @@ class _Attempt(Generic[ShardT]):
     """
 
     number: int
-    shard: ShardT
+    shard: engine.ShardT
     tries: int = 0
     avoid: frozenset[str] = frozenset()
 
 
-class Run(Generic[ShardT, ResultT]):
+class Run(Generic[engine.ShardT, engine.ResultT]):
     """The futures of one call of `DaskEngine.map`.
 
     Args:
@@ -53,8 +53,8 @@ class Run(Generic[ShardT, ResultT]):
         self,
         connection: Connection,
         settings: DaskSettings,
-        work: Work[ShardT, ResultT],
-        report: Report,
+        work: engine.Work[engine.ShardT, engine.ResultT],
+        report: engine.Report,
     ) -> None:
         self._connection = connection
         self._settings = settings
@@ -62,10 +62,12 @@ class Run(Generic[ShardT, ResultT]):
         self._report = report
         self._name = f"cfx-{uuid.uuid4().hex[:12]}"
         self._submitted = 0
-        self._running: dict[Any, _Attempt[ShardT]] = {}
+        self._running: dict[Any, _Attempt[engine.ShardT]] = {}
         self._done: queue.SimpleQueue[Any] = queue.SimpleQueue()
 
-    def results(self, shards: Iterable[ShardT]) -> Generator[tuple[int, ResultT], None, None]:
+    def results(
+        self, shards: Iterable[engine.ShardT]
+    ) -> Generator[tuple[int, engine.ResultT], None, None]:
         """Yields the number and result of each shard as it is finished.
 
         Raises:
@@ -91,7 +93,7 @@ class Run(Generic[ShardT, ResultT]):
         threads = sum(self._connection.threads.values())
         return max(1, threads * (1 + self._settings.waiting))
 
-    def _submit(self, attempt: _Attempt[ShardT]) -> None:
+    def _submit(self, attempt: _Attempt[engine.ShardT]) -> None:
         if not self._connection.threads:
             self._connection.wait()
         others = set(self._connection.threads) - attempt.avoid
@@ -111,7 +113,7 @@ class Run(Generic[ShardT, ResultT]):
         self._running[future] = attempt
         future.add_done_callback(self._done.put)
 
-    def _finished(self) -> Generator[tuple[int, ResultT], None, None]:
+    def _finished(self) -> Generator[tuple[int, engine.ResultT], None, None]:
         """Yields what is finished; waits for a moment if nothing is."""
         try:
             future = self._done.get(timeout=_POLL_S)
@@ -135,7 +137,7 @@ class Run(Generic[ShardT, ResultT]):
             return
         self._unfinished(future, attempt)
 
-    def _unfinished(self, future: Any, attempt: _Attempt[ShardT]) -> None:
+    def _unfinished(self, future: Any, attempt: _Attempt[engine.ShardT]) -> None:
         """Hands out a shard again if its worker is to blame.
 
         Raises:
@@ -163,7 +165,7 @@ class Run(Generic[ShardT, ResultT]):
         else:
             future.result()
 
-    def _again(self, attempt: _Attempt[ShardT], why: str) -> None:
+    def _again(self, attempt: _Attempt[engine.ShardT], why: str) -> None:
         attempt.tries += 1
         if attempt.tries > self._settings.retries:
             raise EngineError(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from cfx.errors import EngineError
-from cfx.plugin import ResultT, ShardT, Unfit, Work, limit_cores, own_cores
+from cfx.plugin import engine, threads
 from cfx_dask.engine.code import differing, installed_code
 from cfx_dask.engine.counting import Counted, counted
 
@@ -26,8 +26,8 @@ class WorkerTrouble(Exception):  # noqa: N818 - the shard is well, its worker is
 
 
 def work_on(
-    work: Work[ShardT, ResultT], shard: ShardT, code: Mapping[str, str]
-) -> Counted[ResultT]:
+    work: engine.Work[engine.ShardT, engine.ResultT], shard: engine.ShardT, code: Mapping[str, str]
+) -> Counted[engine.ResultT]:
     """Does the work of one shard on one core: a worker has one for each of its threads.
 
     Args:
@@ -48,12 +48,12 @@ def work_on(
             f"the worker {get_worker().address} has another {' and '.join(others)} than this job;"
             " install the same on all workers, and start them again"
         )
-    own_cores(1)
-    limit_cores(None)  # what a sweep's job asked for that ran here before
+    threads.own_cores(1)
+    threads.limit_cores(None)  # what a sweep's job asked for that ran here before
     torch.set_num_threads(1)
     try:
         return counted(work, shard)
-    except Unfit as error:
+    except engine.Unfit as error:
         raise WorkerTrouble(str(error), get_worker().address) from error
     except (OSError, MemoryError) as error:
         raise WorkerTrouble(f"{type(error).__name__}: {error}", get_worker().address) from error

@@ -12,7 +12,7 @@ from pathlib import Path
 
 from pythonfmu3 import FmuBuilder
 
-from cfx.plugin import ExportFormat, folder_of, write_output
+from cfx.plugin import ExportFormat, files, folder_of
 from cfx_drivers.onnx.export import OnnxExport
 
 NAME = "driver.fmu"
@@ -38,7 +38,7 @@ class FmiExport(ExportFormat):
                 canHandleVariableCommunicationStepSize=False,
             )
             data = unit.read_bytes()
-        write_output(output, data, "the FMU")
+        files.write_output(output, data, "the FMU")
         return [
             f"{output}: {len(data) / 1e6:.1f} MB; {said.partition('; ')[2]}",
             "It needs Python with numpy and onnxruntime where it is simulated",

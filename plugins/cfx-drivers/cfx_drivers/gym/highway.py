@@ -14,7 +14,7 @@ import torch
 from highway_env.vehicle.behavior import IDMVehicle
 
 from cfx.errors import ConfigError
-from cfx.plugin import COMFORTABLE_BRAKING, DriverState, DriverStep, Motion
+from cfx.plugin import DriverState, DriverStep, Motion, composed
 from cfx_drivers.gym.drivers import driver_step
 
 LOOK_AHEAD_M = 200.0
@@ -72,7 +72,7 @@ class CfxVehicle(IDMVehicle):  # type: ignore[misc]  # highway-env has no types
         )
         self._driven = float(speed)
         if self.lane.speed_limit is not None:
-            slowed = self.speed - COMFORTABLE_BRAKING * step.dt
+            slowed = self.speed - composed.COMFORTABLE_BRAKING * step.dt
             self._driven = min(self._driven, max(self.lane.speed_limit, slowed))
 
     def step(self, dt: float) -> None:

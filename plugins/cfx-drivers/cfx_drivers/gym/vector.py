@@ -22,7 +22,7 @@ from torch import Tensor
 
 import cfx
 from cfx.errors import ConfigError, DataError
-from cfx.plugin import Agent, LimitSettings, Motion, PairBatch, PairSet, limited_speed, name_of
+from cfx.plugin import Agent, LimitSettings, Motion, PairBatch, PairSet, limited_speed, names
 from cfx_drivers.gym.drawing import picture
 from cfx_drivers.gym.drivers import driver_step
 
@@ -249,7 +249,7 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
 
     def _number(self, pair: object) -> int:
         for number, one in enumerate(self.pairs):
-            if one.pair_id == name_of(pair):
+            if one.pair_id == names.name_of(pair):
                 return number
         raise ConfigError(f"options: the recording has no pair '{pair}'")
 

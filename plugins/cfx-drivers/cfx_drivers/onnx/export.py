@@ -11,15 +11,7 @@ from pathlib import Path
 import torch
 
 from cfx.errors import ConfigError, DataError
-from cfx.plugin import (
-    ANY_DRIVER,
-    Agent,
-    DriverStep,
-    ExportFormat,
-    folder_of,
-    load_agent,
-    write_output,
-)
+from cfx.plugin import ANY_DRIVER, Agent, DriverStep, ExportFormat, files, folder_of, load_agent
 from cfx_drivers.onnx.agreement import largest_difference
 from cfx_drivers.onnx.card import card
 from cfx_drivers.onnx.graph import graph_of
@@ -48,9 +40,9 @@ class OnnxExport(ExportFormat):
                 f"{run}: speeds of its ONNX graph differ from cfx's by {difference:.1g} m/s, so it"
                 " was not written; export another policy, and report this one"
             )
-        write_output(output, data, "the ONNX file")
+        files.write_output(output, data, "the ONNX file")
         beside = output.with_suffix(".md")
-        write_output(beside, card(graph, run, len(data), difference), "the card")
+        files.write_output(beside, card(graph, run, len(data), difference), "the card")
         return [
             f"{output}: {len(data) / 1000:.0f} kB; steps of {step.dt:g} s, after each of"
             f" which speeds differ from cfx's by {difference:.1g} m/s at most",

@@ -10,21 +10,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cfx.plugin import (
-    BAND,
-    EDGE,
-    RECORDED,
-    Array,
-    JobFigure,
-    Line,
-    Result,
-    canvas,
-    draw_lines,
-    mark_points,
-    method_label,
-    method_legend,
-    styled,
-)
+from cfx.plugin import RECORDED, JobFigure, Result, canvas, colours, wording
 from cfx_forecasts.traffic.summary import binned, mean_growth, ring_means, traffic_methods
 
 DENSITY_TITLE = "density (vehicles/km)"
@@ -59,8 +45,8 @@ class TrafficPanel:
 
     title: str
     against: str
-    lines: tuple[Line, ...]
-    cloud: tuple[Array, Array] = (np.empty(0), np.empty(0))
+    lines: tuple[canvas.Line, ...]
+    cloud: tuple[canvas.Array, canvas.Array] = (np.empty(0), np.empty(0))
     band: tuple[float, float] | None = None
     limits: tuple[float, float] | None = None
 
@@ -75,9 +61,9 @@ class PathPanel:
     """
 
     method: str
-    time: Array
-    place: Array
-    speed: Array
+    time: canvas.Array
+    place: canvas.Array
+    speed: canvas.Array
 
 
 def traffic_panels(
@@ -122,7 +108,7 @@ def traffic_panels(
         for method in methods:
             found = mean_growth(growth[growth["method"] == method])
             place = found.index.to_numpy(dtype=float)
-            lines.append(Line(method, place, found.to_numpy(dtype=float)))
+            lines.append(canvas.Line(method, place, found.to_numpy(dtype=float)))
         limits = _growth_limits(lines)
         panels.append(
             TrafficPanel("std of speed (m/s)", VEHICLE_TITLE, tuple(lines), limits=limits)
@@ -145,7 +131,9 @@ def path_panels(paths: pd.DataFrame, methods: Sequence[str]) -> tuple[PathPanel,
     return tuple(panels)
 
 
-def _flows(roads: pd.DataFrame, bins: pd.DataFrame, methods: Sequence[str]) -> tuple[Line, ...]:
+def _flows(
+    roads: pd.DataFrame, bins: pd.DataFrame, methods: Sequence[str]
+) -> tuple[canvas.Line, ...]:
     lines = []
     for method in methods:
         found = ring_means(roads[roads["method"] == method], ["flow"])
@@ -153,7 +141,7 @@ def _flows(roads: pd.DataFrame, bins: pd.DataFrame, methods: Sequence[str]) -> t
     return (*lines, *_of_bins(bins, (RECORDED,), "flow"))
 
 
-def _of_bins(bins: pd.DataFrame, methods: Sequence[str], column: str) -> tuple[Line, ...]:
+def _of_bins(bins: pd.DataFrame, methods: Sequence[str], column: str) -> tuple[canvas.Line, ...]:
     lines = []
     for method in methods:
         rows = bins[bins["method"] == method].sort_values("density")
@@ -161,7 +149,7 @@ def _of_bins(bins: pd.DataFrame, methods: Sequence[str], column: str) -> tuple[L
     return tuple(lines)
 
 
-def _waves(roads: pd.DataFrame, real: float, methods: Sequence[str]) -> tuple[Line, ...]:
+def _waves(roads: pd.DataFrame, real: float, methods: Sequence[str]) -> tuple[canvas.Line, ...]:
     lines = []
     for method in methods:
         found = ring_means(roads[roads["method"] == method], ["wave_speed"])
@@ -169,11 +157,11 @@ def _waves(roads: pd.DataFrame, real: float, methods: Sequence[str]) -> tuple[Li
     if np.isfinite(real):
         rings = roads[roads["road"] == "ring"]
         ends = np.array([rings["level"].min(), rings["level"].max()], dtype=float)
-        lines.append(Line(RECORDED, ends, np.array([real, real])))
+        lines.append(canvas.Line(RECORDED, ends, np.array([real, real])))
     return tuple(lines)
 
 
-def _growth_limits(lines: Sequence[Line]) -> tuple[float, float] | None:
+def _growth_limits(lines: Sequence[canvas.Line]) -> tuple[float, float] | None:
     """Returns the axis that the policy's growth can be seen on, if it has any.
 
     Constant parameters with noise may vary ten times as much.
@@ -185,14 +173,14 @@ def _growth_limits(lines: Sequence[Line]) -> tuple[float, float] | None:
     return (0.0, 1.3 * top) if top > 0.2 else None
 
 
-def _line(method: str, against: pd.Series, values: pd.Series) -> Line:
-    return Line(method, against.to_numpy(dtype=float), values.to_numpy(dtype=float))
+def _line(method: str, against: pd.Series, values: pd.Series) -> canvas.Line:
+    return canvas.Line(method, against.to_numpy(dtype=float), values.to_numpy(dtype=float))
 
 
 _COLUMNS = 2
 
 
-@styled
+@canvas.styled
 def draw_traffic(panels: Sequence[TrafficPanel], methods: Sequence[str]) -> Figure:
     """Draws the panels, two beside each other.
 
@@ -201,15 +189,15 @@ def draw_traffic(panels: Sequence[TrafficPanel], methods: Sequence[str]) -> Figu
         methods: of the legend, besides the recorded drivers.
     """
     rows = -(-len(panels) // _COLUMNS)
-    figure = canvas(3.6 * rows + 0.6)
+    figure = canvas.blank(3.6 * rows + 0.6)
     grid = figure.subplots(rows, _COLUMNS, squeeze=False).ravel()
     for axes, panel in zip(grid, panels, strict=False):
-        axes.scatter(*panel.cloud, s=5, color=EDGE, alpha=0.25, linewidths=0, zorder=1)
+        axes.scatter(*panel.cloud, s=5, color=colours.EDGE, alpha=0.25, linewidths=0, zorder=1)
         if panel.band is not None:
-            axes.axhspan(*panel.band, color=BAND, zorder=0.5)
-        draw_lines(axes, panel.lines)
+            axes.axhspan(*panel.band, color=colours.BAND, zorder=0.5)
+        canvas.draw_lines(axes, panel.lines)
         if len(panel.lines) and len(panel.lines[0].time) < 15:
-            mark_points(axes)
+            canvas.mark_points(axes)
         axes.set_xlabel(panel.against)
         axes.set_ylabel(panel.title)
         if panel.limits is not None:
@@ -218,16 +206,16 @@ def draw_traffic(panels: Sequence[TrafficPanel], methods: Sequence[str]) -> Figu
             axes.set_ylim(bottom=0)
     for axes in grid[len(panels) :]:
         axes.remove()
-    method_legend(figure, [RECORDED, *methods])
+    canvas.method_legend(figure, [RECORDED, *methods])
     return figure
 
 
-@styled
+@canvas.styled
 def draw_paths(panels: Sequence[PathPanel]) -> Figure:
     """Draws the vehicles of one ring over time, coloured by their speed; a panel per method."""
     columns = min(3, max(1, len(panels)))
     rows = -(-len(panels) // columns)
-    figure = canvas(2.9 * rows + 0.4)
+    figure = canvas.blank(2.9 * rows + 0.4)
     grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=True).ravel()
     fastest = max((float(panel.speed.max(initial=0.0)) for panel in panels), default=1.0)
     drawn = None
@@ -243,7 +231,7 @@ def draw_paths(panels: Sequence[PathPanel]) -> Figure:
             vmax=max(fastest, 1.0),
             rasterized=True,
         )
-        axes.set_title(method_label(panel.method))
+        axes.set_title(wording.method_label(panel.method))
         axes.grid(visible=False)
         if len(panel.time):
             axes.set_xlim(0.0, float(np.max(panel.time)))

@@ -19,7 +19,6 @@ from torch import Tensor
 
 from cfx.plugin import (
     OBSERVED,
-    SPEED_LIMIT,
     Agent,
     AgentState,
     DrivingModel,
@@ -27,9 +26,9 @@ from cfx.plugin import (
     Leader,
     MemoryStepper,
     Start,
-    WithSpeedLimit,
-    one_thread,
+    composed,
     require_no_further_signals,
+    threads,
 )
 
 RoadKind = Literal["ring", "open", "platoon"]
@@ -320,7 +319,7 @@ def _lane(
 
 
 @torch.no_grad()
-@one_thread()
+@threads.one_thread()
 def simulate_roads(
     model: DrivingModel,
     agent: Agent,
@@ -346,7 +345,7 @@ def simulate_roads(
     require_no_further_signals(agent.core.inputs, "simulated traffic")
     dt, windows = agent.dt, agent.windows
     stepper = agent.stepper(MemoryStepper(model, dt, compile="never"))
-    stepper = stepper.for_model(WithSpeedLimit(stepper.model))
+    stepper = stepper.for_model(composed.WithSpeedLimit(stepper.model))
     follower = stepper.begin(Start(lanes.position, lanes.speed, torch.zeros_like(lanes.speed)))
     ahead = lanes.leader(follower)
     seen = deque([_seen(follower, ahead)] * windows.length, maxlen=windows.length)
@@ -362,7 +361,7 @@ def simulate_roads(
         outside += state.score > 1.0
         p = agent.space.unpack(chosen)
         for _ in range(windows.stride):
-            p[SPEED_LIMIT] = lanes.limit(follower.position)
+            p[composed.SPEED_LIMIT] = lanes.limit(follower.position)
             now = Leader(
                 ahead.position[None], ahead.speed[None], ahead.acceleration[None], ahead.length
             )

@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping
 
 from rich.table import Table
 
-from cfx.plugin import RECORDED, Column, Evaluation, ResultTable, metrics_table
+from cfx.plugin import RECORDED, Column, Evaluation, ResultTable
+from cfx_forecasts.console import metrics_table
 from cfx_forecasts.traffic.summary import traffic_methods, traffic_metrics
 
 METHOD = Column("method", "", "what drives", "text")

@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from cfx.figures.colours import colour_of
 from cfx.figures.drawing import draw_figure, figure_named
-from cfx.figures.text import MINUS, colour_of, method_label
+from cfx.figures.wording import MINUS, method_label
 from cfx.results.result import Result
 from cfx_forecasts.traffic.figures import draw_paths, draw_traffic, path_panels, traffic_panels
 from cfx_forecasts.traffic.section import traffic_sheet

@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from cfx.errors import DataError
-from cfx.plugin import Improvement, improvement_statistics, named_twice, names_of
+from cfx.plugin import Improvement, names, statistics
 from cfx_report.benchmark.row import COUNTS
 
 _NEEDED = ("row", "pair_id", "driver")
@@ -23,13 +23,16 @@ def read_errors(path: Path) -> pd.DataFrame:
         table = pd.read_csv(path)
     except (OSError, ValueError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read as CSV ({error})") from None
-    missing = [name for name in (*_NEEDED, "protocol") if name not in table.columns]
+    missing = []
+    for name in (*_NEEDED, "protocol"):
+        if name not in table.columns:
+            missing.append(name)
     if missing:
         raise DataError(
             f"{path}: column {missing[0]} is missing; --against takes the benchmark_pairs.csv that"
             " cfx benchmark writes"
         )
-    return table.assign(pair_id=names_of(table["pair_id"]))
+    return table.assign(pair_id=names.names_of(table["pair_id"]))
 
 
 def compared(
@@ -54,7 +57,7 @@ def compared(
                 f"{source}, row '{name}': is of the protocol {', '.join(theirs)}, this is of"
                 f" {protocol}; errors of different protocols or pairs do not compare"
             )
-        twice = named_twice(other["pair_id"].tolist())
+        twice = names.named_twice(other["pair_id"].tolist())
         if twice is not None:
             raise DataError(f"{source}, row '{name}': pair '{twice}' stands in it twice")
         both = mine.merge(other, on="pair_id", suffixes=("", "_other"))
@@ -66,7 +69,7 @@ def compared(
         for metric in metrics:
             if f"{metric}_other" not in both:
                 raise DataError(f"{source}, row '{name}': column {metric} is missing")
-            found[str(name), metric] = improvement_statistics(
+            found[str(name), metric] = statistics.improvement_statistics(
                 both[f"{metric}_other"].to_numpy(float),
                 both[metric].to_numpy(float),
                 both["driver"].astype(str).tolist(),

@@ -20,16 +20,13 @@ import torch
 
 from cfx.errors import ConfigError, DataError, nearest
 from cfx.plugin import (
-    FADED,
-    RANGE_SIGNALS,
     READY_FOLDER,
     Agent,
     ExpectedError,
-    atomic_write,
+    files,
     load_agent,
-    path_override,
     save_agent,
-    write_json,
+    valid_range,
 )
 from cfx_report.benchmark.recipes import I80, RECIPES
 
@@ -99,14 +96,14 @@ def publish(name: str, job: Path) -> None:
     if folder.is_dir():
         shutil.rmtree(folder)
     save_agent(agent, folder / "policy")
-    write_json(folder / "metrics.json", metrics)
+    files.write_json(folder / "metrics.json", metrics)
     card = _card(name, agent, metrics, data)
     if (job / "sites.csv").is_file():
         card["sites"] = _sites(pd.read_csv(job / "sites.csv"))
     card["size_kb"] = _kilobytes(folder)
     card["stress"] = _stress(folder)
-    write_json(folder / "card.json", card)
-    with atomic_write(folder / "CARD.md") as temporary:
+    files.write_json(folder / "card.json", card)
+    with files.atomic_write(folder / "CARD.md") as temporary:
         temporary.write_text(card_text(card), encoding="utf-8")
     print(f"wrote {folder}")
 
@@ -114,8 +111,10 @@ def publish(name: str, job: Path) -> None:
 def command_of(name: str) -> str:
     """Returns the command that trains a policy."""
     recipe = RECIPES[name]
-    files = ",".join(recipe.recordings)
-    path = f"data.path={files}" if len(recipe.recordings) == 1 else f"'data.path=[{files}]'"
+    recordings = ",".join(recipe.recordings)
+    path = (
+        f"data.path={recordings}" if len(recipe.recordings) == 1 else f"'data.path=[{recordings}]'"
+    )
     # A shell takes lists of histories as they are, and the published commands have them so.
     words = [shlex.quote(word) if set(word) & set("~ {*") else word for word in recipe.overrides]
     return f"python -m cfx {' '.join(words)} {path}"
@@ -125,11 +124,11 @@ def _train(name: str, data: Path, job: Path) -> None:
     recipe = RECIPES[name]
     command = [sys.executable, "-m", "cfx", *recipe.overrides]
     paths = [
-        path_override("data.path", data.absolute() / file).removeprefix("data.path=")
+        files.path_override("data.path", data.absolute() / file).removeprefix("data.path=")
         for file in recipe.recordings
     ]
     command.append(f"data.path={paths[0]}" if len(paths) == 1 else f"data.path=[{','.join(paths)}]")
-    command.append(path_override("hydra.run.dir", job.absolute()))
+    command.append(files.path_override("hydra.run.dir", job.absolute()))
     # Our own command, no shell.
     done = subprocess.run(command, check=False)  # noqa: S603
     if done.returncode:
@@ -239,13 +238,17 @@ def _range(agent: Agent) -> dict[str, Any]:
     if found is None:
         return {}
     bounds = {}
-    for number, signal in enumerate(RANGE_SIGNALS):
+    for number, signal in enumerate(valid_range.RANGE_SIGNALS):
         low, high = found.low[0, number], found.high[0, number]
         name = signal
         if signal == "log_gap":
             name, low, high = "gap", torch.expm1(low), torch.expm1(high)
         bounds[name] = [round(float(low), 2), round(float(high), 2)]
-    return {"usual": bounds, "mahalanobis_distance": float(found.distance[0]), "faded_at": FADED}
+    return {
+        "usual": bounds,
+        "mahalanobis_distance": float(found.distance[0]),
+        "faded_at": valid_range.FADED,
+    }
 
 
 def _base(agent: Agent) -> dict[str, float]:
@@ -414,8 +417,8 @@ def _pairs(values: dict[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def _usual(valid_range: dict[str, Any]) -> str:
+def _usual(ranges: dict[str, Any]) -> str:
     parts = []
-    for signal, (low, high) in valid_range.get("usual", {}).items():
+    for signal, (low, high) in ranges.get("usual", {}).items():
         parts.append(f"{signal.replace('_', ' ')} {low:g} to {high:g}")
     return ", ".join(parts)

@@ -11,7 +11,7 @@ from typing import Any
 import pandas as pd
 
 from cfx.errors import DataError
-from cfx.plugin import column_of, mean_interval, names_of, write_json
+from cfx.plugin import column_of, files, names, statistics
 from cfx_report.benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash
 
 ROW, PAIRS = "benchmark.json", "benchmark_pairs.csv"
@@ -55,7 +55,7 @@ class Row:
         Raises:
             OutputError: the file cannot be written.
         """
-        write_json(path, asdict(self))
+        files.write_json(path, asdict(self))
 
     @classmethod
     def read(cls, path: Path) -> Row:
@@ -97,8 +97,8 @@ def errors_of(job: Path, row: str, protocol: str, method: str) -> pd.DataFrame:
     columns = {metric: column_of(metric, SCOPE) for metric in METRICS}
     if table.empty or not set(columns.values()) <= set(table.columns):
         raise DataError(f"{job}: has no errors of '{method}' over full trajectories")
-    names = names_of(table["pair_id"])
-    found = pd.DataFrame({"protocol": protocol, "row": row, "pair_id": names}, table.index)
+    pair_ids = names.names_of(table["pair_id"])
+    found = pd.DataFrame({"protocol": protocol, "row": row, "pair_id": pair_ids}, table.index)
     found["driver"] = table["driver"]
     for metric, column in columns.items():
         found[metric] = table[column].astype(float).round(_DIGITS)
@@ -113,7 +113,7 @@ def values_of(errors: pd.DataFrame) -> dict[str, tuple[float, float | None, floa
         if metric in COUNTS:
             values[metric] = (float(errors[metric].sum()), None, None)
         else:
-            values[metric] = mean_interval(errors[metric].tolist(), drivers)
+            values[metric] = statistics.mean_interval(errors[metric].tolist(), drivers)
     return values
 
 

@@ -12,7 +12,7 @@ from typing import cast
 
 import cfx
 from cfx.errors import ConfigError, DataError, Terminated, nearest
-from cfx.plugin import atomic_write, path_override
+from cfx.plugin import files
 from cfx_report.benchmark.frozen import DATA, DATA_NAME, FROZEN_KEYS, METHODS, OVERRIDES
 from cfx_report.benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_of
 
@@ -64,7 +64,7 @@ def run(
     if fingerprint != DATA:
         about = f"{data.name}, {fingerprint[:12]}"
     job = folder or Path("outputs/benchmark") / _as_file_name(name)
-    command = [*overrides, *OVERRIDES, path_override("data.path", data)]
+    command = [*overrides, *OVERRIDES, files.path_override("data.path", data)]
     protocol = protocol_name(fingerprint)
     print(f"Benchmark {protocol}, row '{name}'; the job's folder: {job}", flush=True)
     _run_job(command, job)
@@ -80,7 +80,7 @@ def run(
         drivers=errors["driver"].nunique(),
         values=values_of(errors),
     )
-    with atomic_write(job / PAIRS) as temporary:
+    with files.atomic_write(job / PAIRS) as temporary:
         errors.to_csv(temporary, index=False)
     row.write(job / ROW)
     return row, job
@@ -167,7 +167,7 @@ def _run_job(command: Sequence[str], job: Path) -> None:
     job.mkdir(parents=True, exist_ok=True)
     record.write_text(json.dumps(list(command)), encoding="utf-8")
     began = time.monotonic()
-    code = main([*command, path_override("hydra.run.dir", job.absolute())])
+    code = main([*command, files.path_override("hydra.run.dir", job.absolute())])
     if code == 130:
         raise KeyboardInterrupt
     if code == 143:

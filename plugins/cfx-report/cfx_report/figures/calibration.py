@@ -1,232 +1,24 @@
-"""What calibration found: parameters, slices of the loss, fits, labels over time."""
+"""How well calibration knows parameters: slices of the loss, fits, labels over time."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import PercentFormatter
 
 from cfx.plugin import (
-    EDGE,
-    INK,
-    NEARLY_BEST,
-    Array,
     JobFigure,
     ParameterAxis,
     Result,
     canvas,
-    colour_of,
-    draw_points,
-    flat_shares,
-    legend_above,
-    method_label,
-    most_across,
-    number_text,
-    percent,
-    plural,
-    points,
-    shortened,
-    side_by_side,
-    styled,
-    unit_label,
-    wrapped,
+    colours,
+    identifiability,
+    pair_lines,
+    wording,
 )
-from cfx_report.figures.trajectories import TIME_TITLE
-
-AT_BOUND = 0.01
-"""So near to a bound, as a share of the distance between both, a value is at it."""
-
-
-@dataclass(frozen=True)
-class ParameterSpread:
-    """Calibrated values of one parameter, D drivers' pairs; SI units.
-
-    Attributes:
-        axis: its name, unit and bounds.
-        values: `(D,)`, driver-specific.
-        pooled: `(F,)`, each different pooled value; empty if none was calibrated.
-        default: the model's.
-    """
-
-    axis: ParameterAxis
-    values: Array
-    pooled: Array
-    default: float
-
-    def places(self, values: Array) -> Array:
-        """Returns where values lie between the bounds: 0 at the lower, 1 at the upper."""
-        assert self.axis.low is not None
-        assert self.axis.high is not None
-        return (values - self.axis.low) / (self.axis.high - self.axis.low)
-
-    @property
-    def at_low(self) -> float:
-        """Share of the pairs at the lower bound."""
-        return float((self.places(self.values) < AT_BOUND).mean())
-
-    @property
-    def at_high(self) -> float:
-        """Share of the pairs at the upper bound."""
-        return float((self.places(self.values) > 1 - AT_BOUND).mean())
-
-
-def parameter_spreads(
-    table: pd.DataFrame, axes: Sequence[ParameterAxis]
-) -> tuple[ParameterSpread, ...]:
-    """Returns the spread of each parameter whose bounds and values are known.
-
-    Args:
-        table: a row per pair and method with columns `method` and `parameter_NAME`.
-        axes: the tuned parameters.
-    """
-    found = []
-    for axis in axes:
-        column = f"parameter_{axis.name}"
-        if column not in table or axis.low is None or axis.high is None or axis.high <= axis.low:
-            continue
-        values = _known(table, "fixed", column)
-        default = _known(table, "default", column)
-        if len(values) and len(default):
-            pooled = np.unique(_known(table, "population", column))
-            found.append(ParameterSpread(axis, values, pooled, float(default[0])))
-    return tuple(found)
-
-
-def _known(table: pd.DataFrame, method: str, column: str) -> Array:
-    values = np.asarray(table.loc[table["method"] == method, column], dtype=np.float64)
-    return np.asarray(values[np.isfinite(values)], dtype=np.float64)
-
-
-def spread_offsets(count: int) -> Array:
-    """Returns offsets of dots across their line, `(count,)`, -1 to 1, the same each time.
-
-    They follow the golden ratio, so that neighbours lie apart.
-    """
-    steps = np.arange(count, dtype=np.float64) * 0.6180339887498949
-    return np.asarray(2 * (steps % 1) - 1, dtype=np.float64)
-
-
-def correlations(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> pd.DataFrame:
-    """Returns Spearman's rank correlations of driver-specific parameters, names by names.
-
-    NaN where a parameter does not vary.
-    """
-    columns = {}
-    for axis in axes:
-        if f"parameter_{axis.name}" in table:
-            columns[f"parameter_{axis.name}"] = axis.name
-    rows = table.loc[table["method"] == "fixed", list(columns)].rename(columns=columns)
-    return rows.astype(float).corr("spearman")
-
-
-_WIDTH = 0.3
-"""Of a line of dots, half of it; lines are 1 apart."""
-
-
-@styled
-def draw_calibration(spreads: Sequence[ParameterSpread], table: pd.DataFrame) -> Figure:
-    """Draws each parameter's calibrated values between its bounds; beside it their correlations.
-
-    Args:
-        spreads: of at least one parameter.
-        table: as `correlations` returns it.
-    """
-    figure = canvas(1.7 + 0.42 * max(len(spreads), 4))
-    left, right = side_by_side(figure, (2.0, 1.0))
-    _values(left, spreads)
-    _correlations(right, table)
-    legend_above(figure, left.get_legend_handles_labels()[0], handlelength=1.2)
-    return figure
-
-
-def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
-    rows = np.arange(len(spreads), dtype=float)
-    for row, spread in zip(rows, spreads, strict=True):
-        axes.vlines((0, 1), row - 0.42, row + 0.42, color=EDGE, linewidth=1)
-        places = spread.places(spread.values)
-        named = {
-            method: method_label(method) if row == 0 else "" for method in ("fixed", "default")
-        }
-        aside = row + _WIDTH * spread_offsets(len(places))
-        dots: dict[str, Any] = {"alpha": 0.55, "markeredgewidth": 0, "label": named["fixed"]}
-        draw_points(axes, places, aside, "o", colour_of("fixed"), 3.2, **dots)
-        pooled = spread.places(spread.pooled)
-        said = method_label("population") if row == 0 and len(pooled) else ""
-        rows_of_it = np.full(len(pooled), row)
-        draw_points(axes, pooled, rows_of_it, "D", colour_of("population"), 6, label=said)
-        default, bar = spread.places(np.array([spread.default])), {"markeredgewidth": 2.2}
-        draw_points(
-            axes, default, [row], "|", colour_of("default"), 17, label=named["default"], **bar
-        )
-        _ends(axes, spread, row)
-    names = [unit_label(spread.axis.name, spread.axis.unit) for spread in spreads]
-    axes.set_yticks(rows, names)
-    axes.set_ylim(len(spreads) - 0.4, -0.6)
-    axes.set_xlim(-0.16, 1.16)
-    axes.set_xticks((0, 0.25, 0.5, 0.75, 1.0))
-    axes.xaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
-    axes.grid(visible=False, axis="y")
-    axes.tick_params(axis="y", length=0)
-    axes.set_xlabel(
-        wrapped("place between the bounds; at the ends: the bound, and the share of pairs at it")
-    )
-
-
-def _ends(axes: Axes, spread: ParameterSpread, row: float) -> None:
-    for place, bound, share, side in (
-        (-0.02, spread.axis.low, spread.at_low, "right"),
-        (1.02, spread.axis.high, spread.at_high, "left"),
-    ):
-        assert bound is not None
-        text = number_text(bound)
-        if share > 0:
-            text += f"\n{percent(share).lstrip('+')}"
-        axes.text(place, row, text, ha=side, va="center", fontsize=points(8.5), color=INK)
-
-
-def _correlations(axes: Axes, table: pd.DataFrame) -> None:
-    values = table.to_numpy(dtype=float)
-    axes.imshow(values, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
-    places = np.arange(len(table))
-    axes.set_xticks(places, list(table.columns), rotation=90)
-    axes.set_yticks(places, list(table.columns))
-    axes.grid(visible=False)
-    axes.tick_params(length=0)
-    if len(table) <= 7:
-        for row, column in np.argwhere(np.isfinite(values)):
-            value = values[row, column]
-            colour = "white" if abs(value) > 0.6 else INK
-            axes.text(
-                column, row, f"{value:z.1f}", ha="center", va="center", color=colour, size=points(9)
-            )
-    axes.set_title("rank correlation over drivers")
-
-
-class Calibration(JobFigure):
-    """Calibrated parameters of all drivers between their bounds, and their correlations."""
-
-    title = "Calibrated parameters of all drivers, and their rank correlations"
-    caption = (
-        "Each driver's own parameters (a dot per pair), calibrated on the first part of their"
-        " trajectory; pooled and default parameters beside them. Where values gather at a bound, or"
-        " spread over the whole range, these recordings may hardly determine the parameter."
-    )
-    order = 70
-
-    def draw(self, result: Result) -> Figure | None:
-        """Draws it where drivers have parameters of their own."""
-        spreads = parameter_spreads(result.pairs, result.parameters)
-        if not spreads:
-            return None
-        table = correlations(result.pairs, [spread.axis for spread in spreads])
-        return draw_calibration(spreads, table)
-
 
 RATIO_TITLE = "loss, as a multiple of the best"
 HIGHEST = 2.0
@@ -254,21 +46,21 @@ class SlicePanel:
     """
 
     axis: ParameterAxis
-    places: Array
-    values: Array
-    ratios: Array
+    places: canvas.Array
+    values: canvas.Array
+    ratios: canvas.Array
     near: float
     flat: float
 
     @property
-    def lines(self) -> Array:
+    def lines(self) -> canvas.Array:
         """The ratios of those pairs that are drawn."""
         few = min(len(self.ratios), MOST_LINES)
         chosen = np.linspace(0, len(self.ratios) - 1, few).round().astype(int)
         return np.asarray(self.ratios[chosen], dtype=np.float64)
 
     @property
-    def median(self) -> Array:
+    def median(self) -> canvas.Array:
         """Median over the pairs, `(G,)`."""
         return np.asarray(np.median(self.ratios, axis=0), dtype=np.float64)
 
@@ -281,7 +73,7 @@ def slice_panels(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> tuple[Sl
         axes: the tuned parameters.
     """
     panels = []
-    shares = flat_shares(table)
+    shares = identifiability.flat_shares(table)
     for axis in axes:
         rows = table[table["parameter"] == axis.name]
         if rows.empty:
@@ -338,12 +130,18 @@ def labels_of(
         the window, as a share of the 90 % quantile over all windows (0 is arbitrary), and
         `fixed_NAME`, the driver-specific parameters.
     """
-    names = [axis.name for axis in axes if f"parameter_{axis.name}" in labels]
+    names = []
+    for axis in axes:
+        if f"parameter_{axis.name}" in labels:
+            names.append(axis.name)
     if labels.empty or not names:
         return {}
     own = pairs[pairs["method"] == "fixed"].drop_duplicates("pair_id").set_index("pair_id")
     ids = labels["pair_id"].astype(str)
-    known = [one for one in own.index.astype(str) if one in set(ids)]
+    known = []
+    for one in own.index.astype(str):
+        if one in set(ids):
+            known.append(one)
     if not known:
         return {}
     scale = float(np.quantile(labels["sensitivity"].to_numpy(dtype=float), 0.9)) or 1.0
@@ -360,69 +158,74 @@ _ACROSS = 5
 _MARKERS = {"fixed": "o", "population": "D", "default": "|"}
 
 
-@styled
+@canvas.styled
 def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
     """Draws the loss along each parameter: a line per pair, and their median."""
-    across = min(most_across(_ACROSS), len(panels))
+    across = min(canvas.most_across(_ACROSS), len(panels))
     rows = -(-len(panels) // across)
-    figure = canvas(0.9 + 2.3 * rows)
+    figure = canvas.blank(0.9 + 2.3 * rows)
     grid = figure.subplots(rows, across, squeeze=False, sharey=True)
     for place, panel in zip(grid.flat, panels, strict=False):
-        place.plot(panel.places, panel.lines.T, color=colour_of("fixed"), alpha=0.15, linewidth=0.8)
-        place.plot(panel.places, panel.median, color=INK, linewidth=2)
-        place.axhline(1 + NEARLY_BEST, color=EDGE, linestyle="--", linewidth=1)
-        share = percent(panel.near).lstrip("+")
-        place.set_title(f"{unit_label(panel.axis.name, panel.axis.unit)}: {share}")
-        ends = [number_text(panel.values[0]), number_text(panel.values[-1])]
+        place.plot(
+            panel.places, panel.lines.T, color=colours.colour_of("fixed"), alpha=0.15, linewidth=0.8
+        )
+        place.plot(panel.places, panel.median, color=colours.INK, linewidth=2)
+        place.axhline(
+            1 + identifiability.NEARLY_BEST, color=colours.EDGE, linestyle="--", linewidth=1
+        )
+        share = wording.percent(panel.near).lstrip("+")
+        place.set_title(f"{wording.unit_label(panel.axis.name, panel.axis.unit)}: {share}")
+        ends = [wording.number_text(panel.values[0]), wording.number_text(panel.values[-1])]
         place.set_xticks([0, 1], ends)
         place.set_ylim(0.97, HIGHEST)
     for unused in grid.flat[len(panels) :]:
         unused.set_visible(False)
-    figure.supylabel(RATIO_TITLE, fontsize=points(10.5), color=INK)
-    drivers = plural(len(panels[0].ratios), "pair")
+    figure.supylabel(RATIO_TITLE, fontsize=canvas.points(10.5), color=colours.INK)
+    drivers = wording.plural(len(panels[0].ratios), "pair")
     figure.supxlabel(
-        wrapped(
+        canvas.wrapped(
             f"one parameter moved from bound to bound, the others held; {drivers} and their median."
             " Percentages: the range on which\na pair's loss is within"
-            f" {percent(NEARLY_BEST).lstrip('+')} of its best (dashed), median over pairs"
+            f" {wording.percent(identifiability.NEARLY_BEST).lstrip('+')} of its best (dashed),"
+            " median over pairs"
         ),
-        fontsize=points(10.5),
-        color=INK,
+        fontsize=canvas.points(10.5),
+        color=colours.INK,
     )
     return figure
 
 
-@styled
+@canvas.styled
 def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
     """Draw each pair's error on the part that was calibrated on against that on the test part."""
-    figure = canvas(5.2, 6.4)
+    figure = canvas.blank(5.2, 6.4)
     axes = figure.subplots()
     highest = 0.0
     for method, rows in fits.items():
         train = rows["train_rmse_speed"].to_numpy(dtype=float)
         test = rows["test_rmse_speed"].to_numpy(dtype=float)
-        own, colour = method == "fixed", colour_of(method)
+        own, colour = method == "fixed", colours.colour_of(method)
         highest = max(highest, float(np.quantile(np.concatenate([train, test]), 0.98)))
         medians = f"median {np.median(train):.2f} and {np.median(test):.2f} m/s"
         size, above, filled = (4.5, 3, colour) if own else (5.5, 2, "none")
-        drawn = draw_points(axes, train, test, _MARKERS[method], colour, size, alpha=0.65)
+        drawn = canvas.draw_points(axes, train, test, _MARKERS[method], colour, size, alpha=0.65)
         drawn.set(
-            label=wrapped(f"{method_label(method)}: {medians}"),
+            label=canvas.wrapped(f"{wording.method_label(method)}: {medians}"),
             zorder=above,
             markerfacecolor=filled,
         )
     end = 1.15 * highest
-    axes.plot([0, end], [0, end], color=EDGE, linewidth=1, zorder=1)
+    axes.plot([0, end], [0, end], color=colours.EDGE, linewidth=1, zorder=1)
     axes.set_xlim(0, end)
     axes.set_ylim(0, end)
     axes.set_aspect("equal")
-    axes.set_xlabel(wrapped("RMSE of speed on the part calibrated on (m/s)"))
+    axes.set_xlabel(canvas.wrapped("RMSE of speed on the part calibrated on (m/s)"))
     axes.set_ylabel("RMSE of speed on the test part (m/s)")
-    legend_above(figure, columns=1, handlelength=1.0)
+    canvas.legend_above(figure, columns=1, handlelength=1.0)
     return figure
 
 
-@styled
+@canvas.styled
 def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
     """Draw one pair's per-window parameters; pale ones did not matter in their window.
 
@@ -432,7 +235,7 @@ def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis
         axes: the tuned parameters.
     """
     shown = [axis for axis in axes if f"fixed_{axis.name}" in labels]
-    figure = canvas(1.0 + 1.15 * (len(shown) + 1))
+    figure = canvas.blank(1.0 + 1.15 * (len(shown) + 1))
     grid = figure.subplots(len(shown) + 1, 1, sharex=True)
     times = labels["time_s"].to_numpy(dtype=float)
     for place, axis in zip(grid, shown, strict=False):
@@ -440,27 +243,32 @@ def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis
             times,
             labels[f"parameter_{axis.name}"].to_numpy(dtype=float),
             s=11,
-            color=colour_of("policy"),
+            color=colours.colour_of("policy"),
             alpha=np.maximum(labels["weight"].to_numpy(dtype=float), 0.08),
             linewidths=0,
         )
         fixed = float(labels[f"fixed_{axis.name}"].iloc[0])
-        place.axhline(fixed, color=colour_of("fixed"), linewidth=1.6)
-        place.set_ylabel(unit_label(axis.name, axis.unit).replace(" ", "\n"), fontsize=points(9))
+        place.axhline(fixed, color=colours.colour_of("fixed"), linewidth=1.6)
+        place.set_ylabel(
+            wording.unit_label(axis.name, axis.unit).replace(" ", "\n"),
+            fontsize=canvas.points(9),
+        )
         if axis.low is not None and axis.high is not None:
             room = 0.06 * (axis.high - axis.low)
             place.set_ylim(axis.low - room, axis.high + room)
-    grid[-1].plot(times, labels["sensitivity"].to_numpy(dtype=float), color=INK, linewidth=1.2)
-    grid[-1].set_ylabel("sensi-\ntivity", fontsize=points(9))
+    grid[-1].plot(
+        times, labels["sensitivity"].to_numpy(dtype=float), color=colours.INK, linewidth=1.2
+    )
+    grid[-1].set_ylabel("sensi-\ntivity", fontsize=canvas.points(9))
     grid[-1].set_ylim(bottom=0)
-    grid[-1].set_xlabel(TIME_TITLE)
+    grid[-1].set_xlabel(pair_lines.TIME_TITLE)
     figure.suptitle(
-        wrapped(
-            f"{shortened(pair_id)}: per-window calibrated parameters; the paler, the less the"
-            " choice mattered; line: driver-specific"
+        canvas.wrapped(
+            f"{wording.shortened(pair_id)}: per-window calibrated parameters; the paler, the less"
+            " the choice mattered; line: driver-specific"
         ),
-        fontsize=points(10.5),
-        color=INK,
+        fontsize=canvas.points(10.5),
+        color=colours.INK,
     )
     return figure
 

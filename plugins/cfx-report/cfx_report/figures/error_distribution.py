@@ -9,26 +9,14 @@ import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
-from cfx.plugin import (
-    DASHES,
-    HIDDEN,
-    JobFigure,
-    Result,
-    canvas,
-    colour_of,
-    finite,
-    method_legend,
-    points,
-    side_by_side,
-    styled,
-)
+from cfx.plugin import JobFigure, Result, canvas, colours
 
 _ERRORS = {"rmse_speed": "RMSE of speed (m/s)", "rmse_gap": "RMSE of gap (m)"}
 _FEWEST = 3
 """Pairs from which on there is a distribution."""
 
 
-@styled
+@canvas.styled
 def draw_error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> Figure:
     """Draws the share of pairs whose error is at most so large, a line per method.
 
@@ -36,23 +24,25 @@ def draw_error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> Figu
         pairs: a row per pair and method: `method`, `rmse_speed`, `rmse_gap`.
         methods: those to show.
     """
-    figure = canvas(3.9)
-    for axes, (column, title) in zip(side_by_side(figure, (1, 1)), _ERRORS.items(), strict=True):
+    figure = canvas.blank(3.9)
+    for axes, (column, title) in zip(
+        canvas.side_by_side(figure, (1, 1)), _ERRORS.items(), strict=True
+    ):
         for method in methods:
             own = pairs.loc[pairs["method"] == method, column]
-            errors = np.sort(finite(own.to_numpy(dtype=float)))
+            errors = np.sort(canvas.finite(own.to_numpy(dtype=float)))
             if len(errors):
                 axes.ecdf(
                     errors,
-                    color=colour_of(method),
-                    linestyle=DASHES.get(method, "solid"),
-                    linewidth=points(1.6),
+                    color=colours.colour_of(method),
+                    linestyle=canvas.DASHES.get(method, "solid"),
+                    linewidth=canvas.points(1.6),
                 )
         axes.set_xlim(left=0)
         axes.set_xlabel(title)
         axes.set_ylabel("share of pairs")
         axes.yaxis.set_major_formatter(PercentFormatter(1.0, symbol=" %"))
-    method_legend(figure, methods)
+    canvas.method_legend(figure, methods)
     return figure
 
 
@@ -68,7 +58,10 @@ class ErrorDistribution(JobFigure):
 
     def draw(self, result: Result) -> Figure | None:
         """Draws it where several pairs were driven by calibrated parameters or a policy."""
-        methods = [method for method in result.shown_methods if method not in HIDDEN]
+        methods = []
+        for method in result.shown_methods:
+            if method not in canvas.HIDDEN:
+                methods.append(method)
         if result.pairs["pair_id"].nunique() < _FEWEST or set(methods) <= {"default"}:
             return None
         return draw_error_distribution(result.pairs, methods)

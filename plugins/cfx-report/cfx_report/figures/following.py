@@ -6,27 +6,12 @@ from collections.abc import Sequence
 
 from matplotlib.figure import Figure
 
-from cfx.plugin import (
-    DASHES,
-    EDGE,
-    HIDDEN,
-    JobFigure,
-    PairTrajectory,
-    Result,
-    canvas,
-    colour_of,
-    method_legend,
-    most_across,
-    points,
-    shortened,
-    styled,
-)
-from cfx_report.figures.trajectories import chosen_pairs
+from cfx.plugin import JobFigure, PairTrajectory, Result, canvas, colours, pair_lines, wording
 
 _PAIRS = 3
 
 
-@styled
+@canvas.styled
 def draw_following(trajectories: Sequence[PairTrajectory], methods: Sequence[str]) -> Figure:
     """Draws the gap of some pairs against the leader's speed less the follower's.
 
@@ -34,9 +19,9 @@ def draw_following(trajectories: Sequence[PairTrajectory], methods: Sequence[str
         trajectories: test parts; a panel each.
         methods: those to show, beside the real driver.
     """
-    across = min(most_across(_PAIRS), len(trajectories))
+    across = min(canvas.most_across(_PAIRS), len(trajectories))
     rows = -(-len(trajectories) // across)
-    figure = canvas(0.7 + 3.2 * rows)
+    figure = canvas.blank(0.7 + 3.2 * rows)
     grid = figure.subplots(rows, across, squeeze=False)
     for axes, trajectory in zip(grid.flat, trajectories, strict=False):
         speeds = {"real": trajectory.real_speed, **trajectory.speed}
@@ -45,18 +30,18 @@ def draw_following(trajectories: Sequence[PairTrajectory], methods: Sequence[str
             axes.plot(
                 trajectory.leader_speed - speeds[method],
                 gaps[method],
-                color=colour_of(method),
-                linestyle=DASHES.get(method, "solid"),
-                linewidth=points(1.4),
+                color=colours.colour_of(method),
+                linestyle=canvas.DASHES.get(method, "solid"),
+                linewidth=canvas.points(1.4),
             )
-        axes.axvline(0, color=EDGE, linewidth=points(0.9))
-        axes.set_title(shortened(trajectory.pair_id))
+        axes.axvline(0, color=colours.EDGE, linewidth=canvas.points(0.9))
+        axes.set_title(wording.shortened(trajectory.pair_id))
         axes.set_xlabel("relative speed (m/s)")
     for row in grid:
         row[0].set_ylabel("gap (m)")
     for unused in grid.flat[len(trajectories) :]:
         unused.set_visible(False)
-    method_legend(figure, ["real", *methods])
+    canvas.method_legend(figure, ["real", *methods])
     return figure
 
 
@@ -77,7 +62,7 @@ class Following(JobFigure):
             return None
         methods = []
         for method in result.shown_methods:
-            if method in result.trajectories[0].speed and method not in HIDDEN:
+            if method in result.trajectories[0].speed and method not in canvas.HIDDEN:
                 methods.append(method)
-        pairs = [trajectory for _, trajectory in chosen_pairs(result, None, _PAIRS)]
+        pairs = [trajectory for _, trajectory in pair_lines.chosen_pairs(result, None, _PAIRS)]
         return draw_following(pairs, methods)

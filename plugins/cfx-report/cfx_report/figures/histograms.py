@@ -9,28 +9,15 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.plugin import (
-    DASHES,
-    JobFigure,
-    Result,
-    canvas,
-    colour_of,
-    legend_above,
-    method_label,
-    most_across,
-    points,
-    styled,
-    unit_label,
-)
-from cfx_report.figures.calibration import ParameterSpread, parameter_spreads
+from cfx.plugin import JobFigure, Result, canvas, colours, parameter_spread, wording
 
 _ACROSS = 5
 _BINS = (6, 30)
 """Fewest and most bins; in between there are twice the square root of the number of pairs."""
 
 
-@styled
-def draw_histograms(spreads: Sequence[ParameterSpread]) -> Figure:
+@canvas.styled
+def draw_histograms(spreads: Sequence[parameter_spread.ParameterSpread]) -> Figure:
     """Draws a panel per parameter: how many pairs have which driver-specific value.
 
     Bins lie between the bounds. Lines mark the default and the pooled values.
@@ -38,9 +25,9 @@ def draw_histograms(spreads: Sequence[ParameterSpread]) -> Figure:
     Args:
         spreads: of at least one parameter.
     """
-    across = min(most_across(_ACROSS), len(spreads))
+    across = min(canvas.most_across(_ACROSS), len(spreads))
     rows = -(-len(spreads) // across)
-    figure = canvas(0.8 + 2.2 * rows)
+    figure = canvas.blank(0.8 + 2.2 * rows)
     grid = figure.subplots(rows, across, squeeze=False, sharey=True)
     for axes, spread in zip(grid.flat, spreads, strict=False):
         _histogram(axes, spread)
@@ -48,11 +35,11 @@ def draw_histograms(spreads: Sequence[ParameterSpread]) -> Figure:
         unused.set_visible(False)
     for row in grid:
         row[0].set_ylabel("pairs")
-    legend_above(figure, grid[0, 0].get_legend_handles_labels()[0], handlelength=1.6)
+    canvas.legend_above(figure, grid[0, 0].get_legend_handles_labels()[0], handlelength=1.6)
     return figure
 
 
-def _histogram(axes: Axes, spread: ParameterSpread) -> None:
+def _histogram(axes: Axes, spread: parameter_spread.ParameterSpread) -> None:
     assert spread.axis.low is not None
     assert spread.axis.high is not None
     bins = int(np.clip(2 * np.sqrt(len(spread.values)), *_BINS))
@@ -63,22 +50,22 @@ def _histogram(axes: Axes, spread: ParameterSpread) -> None:
         counts,
         width=np.diff(edges),
         align="edge",
-        color=colour_of("fixed"),
+        color=colours.colour_of("fixed"),
         edgecolor="white",
-        linewidth=points(0.5),
-        label=method_label("fixed"),
+        linewidth=canvas.points(0.5),
+        label=wording.method_label("fixed"),
     )
     marks = {"default": np.array([spread.default]), "population": spread.pooled}
     for method, values in marks.items():
         for number, value in enumerate(values):
             axes.axvline(
                 value,
-                color=colour_of(method),
-                linestyle=DASHES[method],
-                linewidth=points(1.8),
-                label=method_label(method) if number == 0 else None,
+                color=colours.colour_of(method),
+                linestyle=canvas.DASHES[method],
+                linewidth=canvas.points(1.8),
+                label=wording.method_label(method) if number == 0 else None,
             )
-    axes.set_xlabel(unit_label(spread.axis.name, spread.axis.unit))
+    axes.set_xlabel(wording.unit_label(spread.axis.name, spread.axis.unit))
     axes.set_xlim(edges[0], edges[-1])
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.yaxis.set_major_locator(MaxNLocator(4, integer=True, min_n_ticks=1))
@@ -97,5 +84,5 @@ class ParameterHistograms(JobFigure):
 
     def draw(self, result: Result) -> Figure | None:
         """Draws it where drivers have parameters of their own."""
-        spreads = parameter_spreads(result.pairs, result.parameters)
+        spreads = parameter_spread.parameter_spreads(result.pairs, result.parameters)
         return draw_histograms(spreads) if spreads else None

@@ -8,27 +8,17 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cfx.plugin import (
-    EDGE,
-    JOB_COLOURS,
-    Against,
-    canvas,
-    draw_points,
-    most_across,
-    percent,
-    points,
-    styled,
-    summaries_disagree,
-    wrapped,
-)
+from cfx.plugin import canvas, colours, headline, statistics, wording
 
 _ACROSS = 3
 _MOST = 6
 """Others that are shown; the next best come first."""
 
 
-@styled
-def draw_models(errors: Mapping[str, pd.DataFrame], compared: Sequence[Against]) -> Figure:
+@canvas.styled
+def draw_models(
+    errors: Mapping[str, pd.DataFrame], compared: Sequence[statistics.Against]
+) -> Figure:
     """Draws a panel per other job: a dot per pair; above the line the best job is closer.
 
     Args:
@@ -36,9 +26,9 @@ def draw_models(errors: Mapping[str, pd.DataFrame], compared: Sequence[Against])
         compared: as it returns them in `against`; at least one.
     """
     shown = compared[:_MOST]
-    across = min(most_across(_ACROSS), len(shown))
+    across = min(canvas.most_across(_ACROSS), len(shown))
     rows = -(-len(shown) // across)
-    figure = canvas(0.4 + 3.3 * rows, 3.5 * across)
+    figure = canvas.blank(0.4 + 3.3 * rows, 3.5 * across)
     grid = figure.subplots(rows, across, squeeze=False)
     for place, one in enumerate(shown):
         axes = grid.flat[place]
@@ -47,19 +37,19 @@ def draw_models(errors: Mapping[str, pd.DataFrame], compared: Sequence[Against])
         )
         best, other = both["error"].to_numpy(float), both["error_other"].to_numpy(float)
         end = 1.08 * float(np.nanmax(np.concatenate([best, other])))
-        axes.plot([0, end], [0, end], color=EDGE, linewidth=points(1), zorder=1)
-        draw_points(axes, best, other, "o", JOB_COLOURS[place], 4.5, alpha=0.65)
+        axes.plot([0, end], [0, end], color=colours.EDGE, linewidth=canvas.points(1), zorder=1)
+        canvas.draw_points(axes, best, other, "o", colours.JOB_COLOURS[place], 4.5, alpha=0.65)
         axes.set_xlim(0, end)
         axes.set_ylim(0, end)
         axes.set_aspect("equal")
         improvement = one.improvement
-        lead = f"{percent(improvement.geometric, 1)} (p = {one.p_value:.2g})"
-        note = summaries_disagree(improvement.geometric, improvement.ratio_of_means)
+        lead = f"{wording.percent(improvement.geometric, 1)} (p = {one.p_value:.2g})"
+        note = headline.summaries_disagree(improvement.geometric, improvement.ratio_of_means)
         if note:
             lead += f"; {note}"
         axes.set_title(f"{one.best} over {one.other}\n{lead}")
-        axes.set_xlabel(wrapped(f"RMSE of speed of {one.best} (m/s)"))
-        axes.set_ylabel(wrapped(f"RMSE of speed of {one.other} (m/s)"))
+        axes.set_xlabel(canvas.wrapped(f"RMSE of speed of {one.best} (m/s)"))
+        axes.set_ylabel(canvas.wrapped(f"RMSE of speed of {one.other} (m/s)"))
     for unused in grid.flat[len(shown) :]:
         unused.set_visible(False)
     return figure

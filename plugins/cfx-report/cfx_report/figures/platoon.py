@@ -11,23 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from cfx.plugin import (
-    COLLISION_COLOUR,
-    COLOURS,
-    Array,
-    JobFigure,
-    Result,
-    canvas,
-    finite,
-    key_of,
-    legend_above,
-    method_label,
-    number_text,
-    points,
-    side_by_side,
-    styled,
-    vehicle_colour,
-)
+from cfx.plugin import JobFigure, Result, canvas, colours, key_of, wording
 
 TIME_TITLE = "time from the braking of the leader (s)"
 
@@ -38,7 +22,7 @@ _MOST_POINTS = 400
 
 _COLLISION: dict[str, Any] = {
     "marker": "X",
-    "color": COLLISION_COLOUR,
+    "color": colours.COLLISION_COLOUR,
     "markeredgecolor": "white",
     "markersize": 9,
 }
@@ -80,7 +64,7 @@ def _slowing(rows: pd.DataFrame) -> str:
     last = _drop(after[after["vehicle"] == after["vehicle"].max()])
     if not (leader > 0 and np.isfinite(last)):
         return "not defined"
-    return f"{number_text(last / leader)} times the leader's drop"
+    return f"{wording.number_text(last / leader)} times the leader's drop"
 
 
 def _drop(rows: pd.DataFrame) -> float:
@@ -90,7 +74,7 @@ def _drop(rows: pd.DataFrame) -> float:
     return float(speed[: when + 1].max() - speed[when])
 
 
-@styled
+@canvas.styled
 def draw_platoons(
     table: pd.DataFrame, methods: Sequence[str], stable: Mapping[str, float]
 ) -> Figure:
@@ -102,27 +86,27 @@ def draw_platoons(
         stable: by method the share of its platoons that are string stable; one that is not known
             is left out of the titles.
     """
-    figure = canvas(4.3, width=10.5 if len(methods) > 1 else 6.5)
-    grid = side_by_side(figure, [1] * len(methods), sharey=True, sharex=True)
+    figure = canvas.blank(4.3, width=10.5 if len(methods) > 1 else 6.5)
+    grid = canvas.side_by_side(figure, [1] * len(methods), sharey=True, sharex=True)
     speeds = [np.empty(0)]
     for axes, method in zip(grid, methods, strict=True):
         of_method = table[table["method"] == method]
         rows, _ = worst_platoon(of_method)
-        title = [method_label(method)]
+        title = [wording.method_label(method)]
         if method in stable:
             title.append(_stability(stable[method], int(of_method["network"].nunique())))
         title.append(f"last follower: {_slowing(rows)}")
         speeds += _draw_vehicles(axes, rows)
-        axes.set_title("\n".join(title), fontsize=points(9.5 if len(methods) < 4 else 7.5))
+        axes.set_title("\n".join(title), fontsize=canvas.points(9.5 if len(methods) < 4 else 7.5))
         axes.margins(x=0.01)
-    figure.supxlabel(TIME_TITLE, fontsize=points(10.5))
+    figure.supxlabel(TIME_TITLE, fontsize=canvas.points(10.5))
     grid[0].set_ylabel("speed (m/s)")
-    grid[0].set_ylim(*_speed_range(finite(np.concatenate(speeds))))
-    legend_above(figure, _handles(), 4, columnspacing=1.8)
+    grid[0].set_ylim(*_speed_range(canvas.finite(np.concatenate(speeds))))
+    canvas.legend_above(figure, _handles(), 4, columnspacing=1.8)
     return figure
 
 
-def _draw_vehicles(axes: Axes, rows: pd.DataFrame) -> list[Array]:
+def _draw_vehicles(axes: Axes, rows: pd.DataFrame) -> list[canvas.Array]:
     """Draw the speeds of one platoon and where gaps became negative; return the speeds, m/s."""
     begin = braking_time(rows)
     recent = rows[rows["time_s"] >= begin - _SHOWN_BEFORE]
@@ -130,9 +114,9 @@ def _draw_vehicles(axes: Axes, rows: pd.DataFrame) -> list[Array]:
     speeds = []
     for key, of_vehicle in recent.groupby("vehicle", sort=True):
         vehicle = int(float(str(key)))
-        colour, width, above = COLOURS["real"], 2.0, 3
+        colour, width, above = colours.COLOURS["real"], 2.0, 3
         if vehicle > 0:
-            colour, width, above = vehicle_colour(vehicle, last), 1.3, 2
+            colour, width, above = canvas.vehicle_colour(vehicle, last), 1.3, 2
         kept = of_vehicle.iloc[:: -(-len(of_vehicle) // _MOST_POINTS)]
         speed = kept["speed"].to_numpy(dtype=float)
         time = kept["time_s"].to_numpy(dtype=float) - begin
@@ -145,7 +129,7 @@ def _draw_vehicles(axes: Axes, rows: pd.DataFrame) -> list[Array]:
     return speeds
 
 
-def _speed_range(values: Array) -> tuple[float, float]:
+def _speed_range(values: canvas.Array) -> tuple[float, float]:
     """Return the ends of the panels' common axis of speed, m/s."""
     if not len(values):
         return 0.0, 1.0
@@ -155,9 +139,9 @@ def _speed_range(values: Array) -> tuple[float, float]:
 
 def _handles() -> list[Line2D]:
     return [
-        Line2D([], [], color=COLOURS["real"], linewidth=2.0, label="leader"),
-        Line2D([], [], color=vehicle_colour(1, 10), linewidth=1.6, label="first follower"),
-        Line2D([], [], color=vehicle_colour(10, 10), linewidth=1.6, label="last follower"),
+        Line2D([], [], color=colours.COLOURS["real"], linewidth=2.0, label="leader"),
+        Line2D([], [], color=canvas.vehicle_colour(1, 10), linewidth=1.6, label="first follower"),
+        Line2D([], [], color=canvas.vehicle_colour(10, 10), linewidth=1.6, label="last follower"),
         Line2D([], [], linestyle="none", label="collision", **_COLLISION),
     ]
 

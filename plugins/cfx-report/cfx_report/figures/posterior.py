@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from cfx.plugin import (
-    EDGE,
-    INK,
     INTERVAL_LEVEL,
     MIN_NARROWING,
     JobFigure,
@@ -21,15 +19,8 @@ from cfx.plugin import (
     Result,
     are_reliable,
     canvas,
-    colour_of,
-    legend_above,
-    most_across,
-    plural,
-    points,
-    shortened,
-    styled,
-    unit_label,
-    wrapped,
+    colours,
+    wording,
 )
 
 _ACROSS = 5
@@ -51,7 +42,7 @@ def interval_rows(fits: pd.DataFrame) -> pd.DataFrame:
     return fits[(fits["method"] == "fixed") & fits["effective_samples"].notna()]
 
 
-@styled
+@canvas.styled
 def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
     """Draws each driver's interval of each parameter, in the order of their medians.
 
@@ -59,9 +50,9 @@ def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
         rows: as `interval_rows` returns them, at least one.
         axes: the tuned parameters.
     """
-    across = min(most_across(_ACROSS), len(axes))
+    across = min(canvas.most_across(_ACROSS), len(axes))
     down = -(-len(axes) // across)
-    figure = canvas(1.1 + 2.4 * down)
+    figure = canvas.blank(1.1 + 2.4 * down)
     grid = figure.subplots(down, across, squeeze=False)
     for place, axis in zip(grid.flat, axes, strict=False):
         _intervals(place, rows, axis)
@@ -71,11 +62,13 @@ def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
     for place in grid.flat:
         for handle, text in zip(*place.get_legend_handles_labels(), strict=True):
             handles.setdefault(text, handle)
-    legend_above(figure, [handles[words] for words, *_ in _KINDS if words in handles])
+    canvas.legend_above(figure, [handles[words] for words, *_ in _KINDS if words in handles])
     figure.supxlabel(
-        wrapped(f"{plural(len(rows), 'pair')}, in the order of their medians (dots)"),
-        fontsize=points(10.5),
-        color=INK,
+        canvas.wrapped(
+            f"{wording.plural(len(rows), 'pair')}, in the order of their medians (dots)"
+        ),
+        fontsize=canvas.points(10.5),
+        color=colours.INK,
     )
     return figure
 
@@ -96,21 +89,21 @@ def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
                 number[which],
                 low[which],
                 high[which],
-                color=colour_of(method),
+                color=colours.colour_of(method),
                 alpha=opacity,
                 linewidth=size,
                 label=words,
             )
-    place.plot(number, middle, ".", color=INK, markersize=2.5)
+    place.plot(number, middle, ".", color=colours.INK, markersize=2.5)
     if axis.low is not None and axis.high is not None:
         for bound in (axis.low, axis.high):
-            place.axhline(bound, color=EDGE, linestyle="--", linewidth=1)
+            place.axhline(bound, color=colours.EDGE, linestyle="--", linewidth=1)
     place.set_xticks([])
     share = int((good & known).sum())
-    place.set_title(f"{unit_label(axis.name, axis.unit)}: {share} of {len(ordered)}")
+    place.set_title(f"{wording.unit_label(axis.name, axis.unit)}: {share} of {len(ordered)}")
 
 
-@styled
+@canvas.styled
 def draw_pairs(
     pair_id: str,
     draws: pd.DataFrame,
@@ -126,7 +119,7 @@ def draw_pairs(
         prior: the same before the recording is seen.
     """
     count = len(axes)
-    figure = canvas(1.0 + 1.15 * count, 2.0 + 1.3 * count)
+    figure = canvas.blank(1.0 + 1.15 * count, 2.0 + 1.3 * count)
     grid = figure.subplots(count, count, squeeze=False)
     for row, vertical in enumerate(axes):
         for column, horizontal in enumerate(axes):
@@ -144,16 +137,18 @@ def draw_pairs(
                 _limits(place.set_ylim, vertical)
                 place.yaxis.set_major_locator(MaxNLocator(3))
             place.xaxis.set_major_locator(MaxNLocator(3))
-            place.tick_params(labelsize=points(8))
+            place.tick_params(labelsize=canvas.points(8))
             place.label_outer()
     for number, axis in enumerate(axes):
-        named = unit_label(axis.name, axis.unit)
-        grid[-1, number].set_xlabel(named, fontsize=points(9))
-        grid[number, 0].set_ylabel(named if number else "draws", fontsize=points(9))
+        named = wording.unit_label(axis.name, axis.unit)
+        grid[-1, number].set_xlabel(named, fontsize=canvas.points(9))
+        grid[number, 0].set_ylabel(named if number else "draws", fontsize=canvas.points(9))
     handles, _ = grid[0, 0].get_legend_handles_labels()
-    legend_above(figure, handles)
-    said = wrapped(f"{shortened(pair_id)}: {plural(len(draws), 'draw')} from the posterior")
-    figure.supxlabel(said, fontsize=points(10.5), color=INK)
+    canvas.legend_above(figure, handles)
+    said = canvas.wrapped(
+        f"{wording.shortened(pair_id)}: {wording.plural(len(draws), 'draw')} from the posterior"
+    )
+    figure.supxlabel(said, fontsize=canvas.points(10.5), color=colours.INK)
     return figure
 
 
@@ -162,7 +157,7 @@ def _scatter(
 ) -> None:
     across = rows[f"parameter_{horizontal.name}"].to_numpy(dtype=float)
     along = rows[f"parameter_{vertical.name}"].to_numpy(dtype=float)
-    place.plot(across, along, ".", color=colour_of(method), alpha=0.4, markersize=2.5)
+    place.plot(across, along, ".", color=colours.colour_of(method), alpha=0.4, markersize=2.5)
 
 
 def _densities(
@@ -172,16 +167,18 @@ def _densities(
     name = f"parameter_{axis.name}"
     both = draws[name] if prior is None else pd.concat([draws[name], prior[name]])
     edges = np.histogram_bin_edges(both.to_numpy(dtype=float), bins=30).tolist()
-    place.hist(draws[name], bins=edges, density=True, color=colour_of("fixed"), label=_AFTER)
+    place.hist(
+        draws[name], bins=edges, density=True, color=colours.colour_of("fixed"), label=_AFTER
+    )
     if prior is not None:
-        colour = colour_of("default")
+        colour = colours.colour_of("default")
         place.hist(
             prior[name], bins=edges, density=True, histtype="step", color=colour, label=_BEFORE
         )
     place.set_yticks([])
 
 
-@styled
+@canvas.styled
 def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
     """Draws the fan of a driver's trajectories, and what was recorded.
 
@@ -189,13 +186,13 @@ def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
         pair_id: of the driver's pair.
         rows: of the table `fan`.
     """
-    figure = canvas(3.6)
+    figure = canvas.blank(3.6)
     place = figure.subplots()
     time = rows["time_s"].to_numpy(dtype=float)
     low, middle, high, measured = (
         rows[name].to_numpy(dtype=float) for name in ("low", "median", "high", "measured")
     )
-    colour = colour_of("fixed")
+    colour = colours.colour_of("fixed")
     place.fill_between(
         time,
         low,
@@ -206,21 +203,21 @@ def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
         label=f"{INTERVAL_LEVEL:.0%} of trajectories",
     )
     place.plot(time, middle, color=colour, label="median")
-    place.plot(time, measured, color=INK, label="recorded")
+    place.plot(time, measured, color=colours.INK, label="recorded")
     after = ~rows["calibrated_on"].to_numpy(dtype=bool)
     if after.any():
         held = (low <= measured) & (measured <= high)
-        place.axvline(time[after][0], color=EDGE, linestyle="--", linewidth=1)
+        place.axvline(time[after][0], color=colours.EDGE, linestyle="--", linewidth=1)
         share = held[after].mean()
-        say = f"{shortened(pair_id)}: {share:.0%} of the steps after the dashed line held"
+        say = f"{wording.shortened(pair_id)}: {share:.0%} of the steps after the dashed line held"
     else:
-        say = shortened(pair_id)
+        say = wording.shortened(pair_id)
     place.set_xlabel("time from the start of the pair (s)")
     signal = str(rows["signal"].iloc[0])
-    place.set_ylabel(unit_label(signal, {"speed": "m/s", "gap": "m"}[signal]))
+    place.set_ylabel(wording.unit_label(signal, {"speed": "m/s", "gap": "m"}[signal]))
     handles, _ = place.get_legend_handles_labels()
-    legend_above(figure, handles)
-    figure.supxlabel(wrapped(say), fontsize=points(10.5), color=INK)
+    canvas.legend_above(figure, handles)
+    figure.supxlabel(canvas.wrapped(say), fontsize=canvas.points(10.5), color=colours.INK)
     return figure
 
 
@@ -254,7 +251,10 @@ class PosteriorIntervals(JobFigure):
         if fits is None:
             return None
         rows = interval_rows(fits)
-        axes = [axis for axis in result.parameters if f"median_{axis.name}" in rows]
+        axes = []
+        for axis in result.parameters:
+            if f"median_{axis.name}" in rows:
+                axes.append(axis)
         return draw_intervals(rows, axes) if len(rows) and axes else None
 
 
@@ -277,7 +277,10 @@ class PosteriorPairs(JobFigure):
             return None
         pair_id = _middle(interval_rows(fits))
         own = draws[draws["pair_id"].astype(str) == pair_id]
-        axes = [axis for axis in result.parameters if f"parameter_{axis.name}" in own]
+        axes = []
+        for axis in result.parameters:
+            if f"parameter_{axis.name}" in own:
+                axes.append(axis)
         prior = result.tables.get("population", result.tables.get("prior"))
         return draw_pairs(pair_id, own, axes, prior) if len(own) and axes else None
 

@@ -10,24 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.plugin import (
-    ALL_TYPES,
-    INDICATORS,
-    INK,
-    JOB_COLOURS,
-    Array,
-    Group,
-    JobFigure,
-    Result,
-    StyleResult,
-    canvas,
-    groups,
-    hover,
-    most_across,
-    name_of_indicator,
-    points,
-    styled,
-)
+from cfx.plugin import JobFigure, Result, StyleResult, canvas, colours, style
 
 _ACROSS = 4
 _VIOLIN = 8
@@ -36,36 +19,36 @@ _VIOLIN = 8
 _TYPE_COLOUR = "#9a9a9a"
 
 
-@styled
-def draw_site_styles(style: StyleResult, distances: pd.DataFrame | None) -> Figure:
+@canvas.styled
+def draw_site_styles(of_drivers: StyleResult, distances: pd.DataFrame | None) -> Figure:
     """Draws a panel for the score and for each indicator, a row per group of drivers.
 
     Every driver is a dot; the thick line is from the lower to the upper quartile, the mark the
     median. The last panel has the distances between sites.
 
     Args:
-        style: of the drivers of at least two sites.
+        of_drivers: of at least two sites.
         distances: as `cfx.data.style.style_distances`.
     """
-    shown = groups(style.table)
-    across = most_across(_ACROSS)
-    panels = len(INDICATORS) + 2
+    shown = style.groups(of_drivers.table)
+    across = canvas.most_across(_ACROSS)
+    panels = len(style.INDICATORS) + 2
     rows = -(-panels // across)
-    figure = canvas(rows * (1.1 + 0.24 * len(shown)))
+    figure = canvas.blank(rows * (1.1 + 0.24 * len(shown)))
     grid = figure.subplots(rows, across, squeeze=False)
     axes = list(grid.flat)
     _panel(
         axes[0],
-        style.table["score"].to_numpy(dtype=float),
+        of_drivers.table["score"].to_numpy(dtype=float),
         shown,
         "style score\n0 conservative, 1 aggressive",
     )
-    for panel, indicator in zip(axes[1:], INDICATORS, strict=False):
-        values = style.table[indicator.name].to_numpy(dtype=float)
+    for panel, indicator in zip(axes[1:], style.INDICATORS, strict=False):
+        values = of_drivers.table[indicator.name].to_numpy(dtype=float)
         unit = indicator.unit.replace("2", "²").replace("4", "⁴")
-        title = f"{name_of_indicator(indicator.name)}\n{unit}"
-        if indicator.name in style.weights:
-            title += f"; weight {style.weights[indicator.name]:.2f}"
+        title = f"{style.name_of_indicator(indicator.name)}\n{unit}"
+        if indicator.name in of_drivers.weights:
+            title += f"; weight {of_drivers.weights[indicator.name]:.2f}"
         _panel(panel, values, shown, title)
     for number, panel in enumerate(axes[: panels - 1]):
         if number % across:
@@ -76,13 +59,17 @@ def draw_site_styles(style: StyleResult, distances: pd.DataFrame | None) -> Figu
     return figure
 
 
-def _panel(axes: Axes, values: Array, shown: Sequence[Group], title: str) -> None:
+def _panel(axes: Axes, values: canvas.Array, shown: Sequence[style.Group], title: str) -> None:
     sites = list(dict.fromkeys(group.site for group in shown))
     scatter = np.random.default_rng(0)
     for place, group in enumerate(shown):
         mine = values[group.chosen & np.isfinite(values)]
-        whole = group.driver_type == ALL_TYPES
-        colour = JOB_COLOURS[sites.index(group.site) % len(JOB_COLOURS)] if whole else _TYPE_COLOUR
+        whole = group.driver_type == style.ALL_TYPES
+        colour = (
+            colours.JOB_COLOURS[sites.index(group.site) % len(colours.JOB_COLOURS)]
+            if whole
+            else _TYPE_COLOUR
+        )
         if len(mine) >= _VIOLIN and np.ptp(mine) > 0:
             violin = axes.violinplot(
                 mine, [place], orientation="horizontal", widths=0.85, showextrema=False
@@ -93,36 +80,50 @@ def _panel(axes: Axes, values: Array, shown: Sequence[Group], title: str) -> Non
             continue
         spread = scatter.uniform(-0.16, 0.16, len(mine)) if len(mine) > 1 else np.zeros(1)
         axes.plot(
-            mine, place + spread, ".", color=colour, markersize=points(2.5), alpha=0.55, mew=0
+            mine,
+            place + spread,
+            ".",
+            color=colour,
+            markersize=canvas.points(2.5),
+            alpha=0.55,
+            mew=0,
         )
         low, middle, high = np.quantile(mine, [0.25, 0.5, 0.75])
-        axes.plot([low, high], [place, place], color=colour, linewidth=points(2.2))
+        axes.plot([low, high], [place, place], color=colour, linewidth=canvas.points(2.2))
         (mark,) = axes.plot(
-            middle, place, "o", color=colour, markeredgecolor="white", markersize=points(6)
+            middle,
+            place,
+            "o",
+            color=colour,
+            markeredgecolor="white",
+            markersize=canvas.points(6),
         )
-        hover(mark, f"{_called(group)}: median {middle:.3g}, {len(mine)} drivers")
+        canvas.hover(mark, f"{_called(group)}: median {middle:.3g}, {len(mine)} drivers")
     axes.set_yticks(range(len(shown)), [_called(group) for group in shown])
     for tick, group in zip(axes.get_yticklabels(), shown, strict=True):
-        tick.set_fontweight("bold" if group.driver_type == ALL_TYPES else "normal")
+        tick.set_fontweight("bold" if group.driver_type == style.ALL_TYPES else "normal")
     axes.set_ylim(len(shown) - 0.4, -0.6)
-    axes.set_title(title, fontsize=points(9.5))
+    axes.set_title(title, fontsize=canvas.points(9.5))
     axes.xaxis.set_major_locator(MaxNLocator(4))
     axes.tick_params(axis="y", length=0)
     axes.grid(visible=False, axis="y")
 
 
-def _called(group: Group) -> str:
-    return group.site if group.driver_type == ALL_TYPES else group.driver_type
+def _called(group: style.Group) -> str:
+    return group.site if group.driver_type == style.ALL_TYPES else group.driver_type
 
 
-def _matrix(axes: Axes, shown: Sequence[Group], distances: pd.DataFrame | None) -> None:
+def _matrix(axes: Axes, shown: Sequence[style.Group], distances: pd.DataFrame | None) -> None:
     """Draws the distances between the scores of sites; pale where chance may explain them."""
-    sites = [group.site for group in shown if group.driver_type == ALL_TYPES]
+    sites = []
+    for group in shown:
+        if group.driver_type == style.ALL_TYPES:
+            sites.append(group.site)
     number = {site: index for index, site in enumerate(sites)}
     matrix = np.full((len(sites), len(sites)), np.nan)
     p_values = np.ones_like(matrix)
     if distances is not None:
-        for _, row in distances[distances["driver_type"] == ALL_TYPES].iterrows():
+        for _, row in distances[distances["driver_type"] == style.ALL_TYPES].iterrows():
             place = number[str(row["other_site"])], number[str(row["site"])]
             matrix[place], p_values[place] = row["distance"], row["p_value"]
     axes.imshow(np.ma.masked_invalid(matrix), cmap="Blues", vmin=0, aspect="auto")
@@ -130,7 +131,7 @@ def _matrix(axes: Axes, shown: Sequence[Group], distances: pd.DataFrame | None) 
     for (row_number, column), value in np.ndenumerate(matrix):
         if np.isfinite(value):
             doubt = "" if p_values[row_number, column] < 0.05 else "\n(chance)"
-            ink = "white" if value > 0.6 * largest else INK
+            ink = "white" if value > 0.6 * largest else colours.INK
             axes.text(
                 column, row_number, f"{value:.2f}{doubt}", ha="center", va="center", color=ink
             )
@@ -140,7 +141,7 @@ def _matrix(axes: Axes, shown: Sequence[Group], distances: pd.DataFrame | None) 
     axes.set_ylim(len(sites) - 0.5, 0.5)
     axes.grid(visible=False)
     axes.tick_params(length=0)
-    axes.set_title("energy distance\nof the style scores", fontsize=points(9.5))
+    axes.set_title("energy distance\nof the style scores", fontsize=canvas.points(9.5))
 
 
 class SiteStyles(JobFigure):
@@ -157,6 +158,6 @@ class SiteStyles(JobFigure):
 
     def draw(self, result: Result) -> Figure | None:
         """Draws it where drivers of several sites are scored."""
-        if result.style is None or not groups(result.style.table):
+        if result.style is None or not style.groups(result.style.table):
             return None
         return draw_site_styles(result.style, result.tables.get("style_distances"))

@@ -8,18 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
-from cfx.plugin import (
-    ALL_SITES,
-    COLOURS,
-    INK,
-    JobFigure,
-    Result,
-    canvas,
-    hover,
-    method_label,
-    percent,
-    percent_tick,
-)
+from cfx.plugin import ALL_SITES, JobFigure, Result, canvas, colours, wording
 
 _PANELS = (("test", "fixed"), ("full_trajectory", "population"))
 """Which part of trajectories is compared with what, one panel each."""
@@ -43,12 +32,12 @@ def draw_sites(sites: pd.DataFrame) -> Figure | None:
     if not panels:
         return None
     names = list(dict.fromkeys(zip(sites["site"], sites["driver_type"], strict=True)))
-    figure = canvas(1.4 + 0.34 * len(names))
+    figure = canvas.blank(1.4 + 0.34 * len(names))
     axes = figure.subplots(1, len(panels), sharey=True, squeeze=False)[0]
     for panel, (scope, baseline) in zip(axes, panels, strict=True):
         _panel(panel, sites[sites["scope"] == scope], baseline, names)
         part = "last part" if scope == "test" else "full trajectories"
-        panel.set_title(f"{part}: over {method_label(baseline)}")
+        panel.set_title(f"{part}: over {wording.method_label(baseline)}")
     axes[0].set_yticks(range(len(names)), [_called(*name) for name in names])
     axes[0].invert_yaxis()
     for tick, (site, kind) in zip(axes[0].get_yticklabels(), names, strict=True):
@@ -70,27 +59,29 @@ def _panel(axes: Axes, rows: pd.DataFrame, baseline: str, names: list[tuple[str,
             continue
         place = places[(row["site"], row["driver_type"])]
         is_whole = row["driver_type"] == ALL_SITES
-        colour = COLOURS["policy"] if is_whole else "#9a9a9a"
+        colour = colours.COLOURS["policy"] if is_whole else "#9a9a9a"
         ends = [float(row[f"over_{baseline}_{end}"]) for end in ("low", "high")]
         if np.isfinite(ends).all():
             axes.plot(np.clip(ends, _WORST, None), [place, place], color=colour, linewidth=2.0)
         (point,) = axes.plot(
             max(value, _WORST), place, "o", color=colour, markersize=7 if is_whole else 5
         )
-        hover(point, f"{_called(row['site'], row['driver_type'])}: {percent(value, 1)}")
+        canvas.hover(
+            point, f"{_called(row['site'], row['driver_type'])}: {wording.percent(value, 1)}"
+        )
         axes.annotate(
-            percent(value, 1),
+            wording.percent(value, 1),
             (max(value, _WORST), place),
             (0, 6),
             textcoords="offset points",
             ha="center",
             va="bottom",
             fontsize=8.5,
-            color=INK,
+            color=colours.INK,
         )
-    axes.axvline(0, color=INK, linewidth=0.9)
+    axes.axvline(0, color=colours.INK, linewidth=0.9)
     axes.set_xlabel("improvement of the RMSE of speed, 95 % interval")
-    axes.xaxis.set_major_formatter(FuncFormatter(percent_tick))
+    axes.xaxis.set_major_formatter(FuncFormatter(canvas.percent_tick))
     axes.set_ylim(-0.8, len(names) - 0.4)
     axes.grid(visible=False, axis="y")
 

@@ -9,25 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cfx.plugin import (
-    CLUSTER_COLOURS,
-    CLUSTERS,
-    INK,
-    Array,
-    JobFigure,
-    Result,
-    StyleResult,
-    canvas,
-    finite,
-    name_of_indicator,
-    plural,
-    points,
-    side_by_side,
-    styled,
-)
+from cfx.plugin import JobFigure, Result, StyleResult, canvas, colours, style, wording
 
 
-def score_bins(scores: Array) -> Array:
+def score_bins(scores: canvas.Array) -> canvas.Array:
     """Return the edges of 8 to 24 equal bins over finite scores."""
     if not len(scores):
         return np.linspace(0.0, 1.0, 9)
@@ -38,27 +23,27 @@ def score_bins(scores: Array) -> Array:
     return np.linspace(low, high, bins + 1)
 
 
-@styled
-def draw_style(style: StyleResult) -> Figure:
+@canvas.styled
+def draw_style(of_drivers: StyleResult) -> Figure:
     """Draw the scores with the cuts and the cluster sizes, and the entropy weights if known."""
-    figure = canvas(3.9)
-    if not style.weights:
-        _histogram(figure.subplots(), style)
+    figure = canvas.blank(3.9)
+    if not of_drivers.weights:
+        _histogram(figure.subplots(), of_drivers)
         return figure
-    left, right = side_by_side(figure, (2.3, 1.0))
-    _histogram(left, style)
-    _weights(right, style.weights)
+    left, right = canvas.side_by_side(figure, (2.3, 1.0))
+    _histogram(left, of_drivers)
+    _weights(right, of_drivers.weights)
     return figure
 
 
-def _histogram(axes: Axes, style: StyleResult) -> None:
-    scores = style.table["score"].to_numpy(dtype=float)
-    clusters = style.table["cluster"].astype(float).astype(int).to_numpy()
-    known = finite(scores)
+def _histogram(axes: Axes, of_drivers: StyleResult) -> None:
+    scores = of_drivers.table["score"].to_numpy(dtype=float)
+    clusters = of_drivers.table["cluster"].astype(float).astype(int).to_numpy()
+    known = canvas.finite(scores)
     edges = score_bins(known)
     bottom = np.zeros(len(edges) - 1)
-    for index, name in enumerate(CLUSTERS):
-        mine = finite(scores[clusters == index])
+    for index, name in enumerate(style.CLUSTERS):
+        mine = canvas.finite(scores[clusters == index])
         counts = np.histogram(mine, edges)[0]
         axes.bar(
             edges[:-1],
@@ -66,7 +51,7 @@ def _histogram(axes: Axes, style: StyleResult) -> None:
             width=np.diff(edges),
             align="edge",
             bottom=bottom,
-            color=CLUSTER_COLOURS[index],
+            color=colours.CLUSTER_COLOURS[index],
             edgecolor="white",
             linewidth=0.8,
             label=f"{name}: {len(mine)}",
@@ -74,15 +59,15 @@ def _histogram(axes: Axes, style: StyleResult) -> None:
         bottom += counts
     top = max(1, int(np.histogram(known, edges)[0].max()))
     axes.set_ylim(0, 1.22 * top)
-    for k, cut in enumerate(finite(style.cuts)):
-        axes.axvline(cut, color=INK, linestyle=(0, (4, 2)), linewidth=1.2)
+    for k, cut in enumerate(canvas.finite(of_drivers.cuts)):
+        axes.axvline(cut, color=colours.INK, linestyle=(0, (4, 2)), linewidth=1.2)
         side, text = ("right", f"{cut:.3f} ") if k == 0 else ("left", f" {cut:.3f}")
-        axes.text(cut, 1.19 * top, text, ha=side, va="top", color=INK)
+        axes.text(cut, 1.19 * top, text, ha=side, va="top", color=colours.INK)
     axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes.grid(visible=False, axis="x")
     title = "style score (0 conservative, 1 aggressive)"
     if len(scores) > len(known):
-        title += f"; {plural(len(scores) - len(known), 'driver')} without a score"
+        title += f"; {wording.plural(len(scores) - len(known), 'driver')} without a score"
     axes.set_xlabel(title)
     axes.set_ylabel("drivers")
     axes.legend(
@@ -94,11 +79,17 @@ def _weights(axes: Axes, weights: Mapping[str, float]) -> None:
     names, values = list(weights), list(weights.values())
     places = np.arange(len(names), dtype=float)
     axes.barh(places, values, height=0.62, color="#b5b5b5")
-    axes.set_yticks(places, [name_of_indicator(name) for name in names])
+    axes.set_yticks(places, [style.name_of_indicator(name) for name in names])
     axes.invert_yaxis()
     for place, value in zip(places, values, strict=True):
         axes.text(
-            value, place, f" {value:.2f}", va="center", ha="left", color=INK, fontsize=points(9.5)
+            value,
+            place,
+            f" {value:.2f}",
+            va="center",
+            ha="left",
+            color=colours.INK,
+            fontsize=canvas.points(9.5),
         )
     axes.set_xlim(0, 1.22 * max([*values, 1e-6]))
     axes.grid(visible=False)

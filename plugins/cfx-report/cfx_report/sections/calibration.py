@@ -8,17 +8,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.plugin import NEARLY_BEST, Purpose, Result, shortened, unit_label
-from cfx.plugin import number_text as shown
-from cfx_report.figures.calibration import (
-    AT_BOUND,
-    ParameterSpread,
-    SlicePanel,
-    draw_labels,
-    labels_of,
-    parameter_spreads,
-    slice_panels,
+from cfx.plugin import (
+    Purpose,
+    Result,
+    identifiability,
+    parameter_spread,  # parameter_spread
+    wording,
 )
+from cfx_report.figures.calibration import SlicePanel, draw_labels, labels_of, slice_panels
 from cfx_report.jobs import Runs, of_purpose
 from cfx_report.section import Cell, Column, Section, Sheet, View, formatted, job_names, number
 
@@ -75,7 +72,7 @@ def _labels(jobs: Sequence[Result]) -> dict[str, View]:
             axes = job.parameters
             drivers = labels_of(job.tables["labels"], job.pairs, axes)
             for pair_id, labels in drivers.items():
-                views[shortened(pair_id)] = View(draw_labels(pair_id, labels, axes))
+                views[wording.shortened(pair_id)] = View(draw_labels(pair_id, labels, axes))
         if views:
             return views
     return {}
@@ -88,12 +85,12 @@ def slices_of(job: Result) -> tuple[SlicePanel, ...]:
     return slice_panels(job.tables["slices"], job.parameters)
 
 
-def spreads_of(job: Result) -> tuple[ParameterSpread, ...]:
+def spreads_of(job: Result) -> tuple[parameter_spread.ParameterSpread, ...]:
     """Returns the spread of each tuned parameter of a job."""
-    return parameter_spreads(job.pairs, job.parameters)
+    return parameter_spread.parameter_spreads(job.pairs, job.parameters)
 
 
-def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:
+def _fingerprint(spreads: tuple[parameter_spread.ParameterSpread, ...]) -> str:
     found = hashlib.sha256()
     for spread in spreads:
         found.update(spread.axis.name.encode())
@@ -105,7 +102,7 @@ def _fingerprint(spreads: tuple[ParameterSpread, ...]) -> str:
 class _Row(NamedTuple):
     """A parameter; `near` and `flat` as of `SlicePanel`, NaN where the loss was not examined."""
 
-    spread: ParameterSpread
+    spread: parameter_spread.ParameterSpread
     near: float
     flat: float
 
@@ -117,7 +114,9 @@ class _Row(NamedTuple):
         return float(self.spread.pooled.mean()) if len(self.spread.pooled) else np.nan
 
 
-def sheet(spreads: Sequence[ParameterSpread], panels: Sequence[SlicePanel] = ()) -> Sheet:
+def sheet(
+    spreads: Sequence[parameter_spread.ParameterSpread], panels: Sequence[SlicePanel] = ()
+) -> Sheet:
     """Returns a row per parameter."""
     examined = {panel.axis.name: (panel.near, panel.flat) for panel in panels}
     unknown = (np.nan, np.nan)
@@ -126,13 +125,21 @@ def sheet(spreads: Sequence[ParameterSpread], panels: Sequence[SlicePanel] = ())
 
 def _name(row: _Row) -> Cell:
     axis = row.spread.axis
-    return Cell(unit_label(axis.name, axis.unit), second=axis.meaning)
+    return Cell(wording.unit_label(axis.name, axis.unit), second=axis.meaning)
 
 
 def _bounds(row: _Row) -> str:
     assert row.spread.axis.low is not None
     assert row.spread.axis.high is not None
-    return f"{shown(row.spread.axis.low)} to {shown(row.spread.axis.high)}"
+    return (
+        f"{wording.number_text(row.spread.axis.low)} to {wording.number_text(row.spread.axis.high)}"
+    )
+
+
+def _middle(row: Any) -> str:
+    """Returns the quantiles between which nine in ten of the drivers' values lie."""
+    low, high = row.quantile(0.05), row.quantile(0.95)
+    return f"{wording.number_text(low)} to {wording.number_text(high)}"
 
 
 _COLUMNS: tuple[Column[_Row], ...] = (
@@ -149,20 +156,22 @@ _COLUMNS: tuple[Column[_Row], ...] = (
     ),
     Column(
         "5 % to 95 %",
-        lambda row: f"{shown(row.quantile(0.05))} to {shown(row.quantile(0.95))}",
+        _middle,
         "Quantiles of the driver-specific values.",
     ),
     Column(
         "At the lower bound",
         lambda row: number(row.spread.at_low, ".0%"),
-        f"Share of the pairs within {formatted(AT_BOUND, '.0%')} of the range of it.",
+        f"Share of the pairs within {formatted(parameter_spread.AT_BOUND, '.0%')} of the range of"
+        " it.",
     ),
     Column("At the upper bound", lambda row: number(row.spread.at_high, ".0%"), "The same."),
     Column(
         "Flat on",
         lambda row: number(row.near, ".0%"),
-        f"Share of the range on which the loss is within {formatted(NEARLY_BEST, '.0%')} of its"
-        " best, the others held; median over pairs.",
+        "Share of the range on which the loss is within"
+        f" {formatted(identifiability.NEARLY_BEST, '.0%')} of its best, the others"
+        " held; median over pairs.",
     ),
     Column(
         "Flat for",

@@ -11,19 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from cfx.plugin import (
-    FULL_TRAJECTORY,
-    METHODS,
-    STEADY,
-    TEST,
-    MetricInfo,
-    Purpose,
-    Result,
-    explained,
-    finite,
-    percent,
-    short_label,
-)
+from cfx.plugin import METHODS, MetricInfo, Purpose, Result, canvas, wording
 from cfx_report.figures.jobs import draw_error_dots, error_limit
 from cfx_report.jobs import (
     Runs,
@@ -54,16 +42,16 @@ _PLATOON = (
 )
 
 _SAFETY = (
-    ("collisions", TEST, "fixed", ".0f", "Collisions"),
-    ("collisions", FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
-    ("hard_braking", TEST, "fixed", ".0f", "Hard braking"),
-    ("hard_braking", FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
-    ("jerk", TEST, "fixed", ".2f", "Jerk (m/s³)"),
-    ("at_bounds", TEST, "fixed", ".0%", "At bounds"),
-    ("platoon/head_to_tail", TEST, "population", ".2f", "Amplification"),
-    ("platoon/string_stable", TEST, "population", ".0%", "Stable"),
-    ("platoon/min_gap", TEST, "population", ".1f", "Least gap (m)"),
-    ("platoon/collisions", TEST, "population", ".0f", "Collisions"),
+    ("collisions", wording.TEST, "fixed", ".0f", "Collisions"),
+    ("collisions", wording.FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
+    ("hard_braking", wording.TEST, "fixed", ".0f", "Hard braking"),
+    ("hard_braking", wording.FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
+    ("jerk", wording.TEST, "fixed", ".2f", "Jerk (m/s³)"),
+    ("at_bounds", wording.TEST, "fixed", ".0%", "At bounds"),
+    ("platoon/head_to_tail", wording.TEST, "population", ".2f", "Amplification"),
+    ("platoon/string_stable", wording.TEST, "population", ".0%", "Stable"),
+    ("platoon/min_gap", wording.TEST, "population", ".1f", "Least gap (m)"),
+    ("platoon/collisions", wording.TEST, "population", ".0f", "Collisions"),
 )
 """Measures: metric, part of the trajectories, baseline that stands below, format, heading."""
 
@@ -81,18 +69,18 @@ _MEANINGS = {
 }
 
 _ERRORS = (
-    ("rmse_speed", TEST),
-    ("rmse_gap", TEST),
-    ("rmse_speed", STEADY),
-    ("rmse_speed", FULL_TRAJECTORY),
-    ("rmse_gap", FULL_TRAJECTORY),
+    ("rmse_speed", wording.TEST),
+    ("rmse_gap", wording.TEST),
+    ("rmse_speed", wording.STEADY),
+    ("rmse_speed", wording.FULL_TRAJECTORY),
+    ("rmse_gap", wording.FULL_TRAJECTORY),
 )
 
 _GAINS = (
-    ("fixed", TEST),
-    ("shrunk", TEST),
-    ("population", TEST),
-    ("population", FULL_TRAJECTORY),
+    ("fixed", wording.TEST),
+    ("shrunk", wording.TEST),
+    ("population", wording.TEST),
+    ("population", wording.FULL_TRAJECTORY),
 )
 
 _JOB = Column[Result]("Job", lambda job: job.name)
@@ -148,28 +136,31 @@ upper reference for the models that follow.</p>
 def closeness(jobs: Sequence[Result]) -> Sheet:
     """Returns a row per job: the errors of each method, and the policy's improvement."""
     frames = {
-        TEST: tested(jobs),
-        FULL_TRAJECTORY: "the full trajectory of unseen drivers, from its first frame on",
+        wording.TEST: tested(jobs),
+        wording.FULL_TRAJECTORY: "the full trajectory of unseen drivers, from its first frame on",
     }
     columns = [_JOB]
     for scope, group in (
-        (TEST, "Test part: RMSE of speed in m/s, below it of gap in m"),
-        (FULL_TRAJECTORY, "Full trajectories: the same"),
+        (wording.TEST, "Test part: RMSE of speed in m/s, below it of gap in m"),
+        (wording.FULL_TRAJECTORY, "Full trajectories: the same"),
     ):
         for method in METHODS:
-            showing = [job for job in jobs if method in job.shown_methods]
+            showing = []
+            for job in jobs:
+                if method in job.shown_methods:
+                    showing.append(job)
             if any_has_metric(showing, "rmse_speed", method, scope):
-                meaning = f"RMSE over {frames[scope]}, with {explained(method)}."
+                meaning = f"RMSE over {frames[scope]}, with {wording.explained(method)}."
                 cell = partial(_error, scope=scope, method=method)
-                columns.append(Column(short_label(method), cell, meaning, group))
+                columns.append(Column(wording.short_label(method), cell, meaning, group))
     for baseline, scope in _GAINS:
         if baseline in any_baselines(jobs, scope):
-            suffix = "" if scope == TEST else ", full"
+            suffix = "" if scope == wording.TEST else ", full"
             meaning = (
-                f"Mean improvement of the RMSE of speed over {explained(baseline)}, on"
+                f"Mean improvement of the RMSE of speed over {wording.explained(baseline)}, on"
                 f" {frames[scope]}; below it the 95 % interval."
             )
-            heading = f"over {short_label(baseline)}{suffix}"
+            heading = f"over {wording.short_label(baseline)}{suffix}"
             cell = partial(_gain, baseline=baseline, scope=scope)
             columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
     return _with_best(Sheet.of(columns, jobs), jobs)
@@ -180,9 +171,11 @@ def safety(jobs: Sequence[Result]) -> Sheet:
     columns = [_JOB]
     for metric, scope, baseline, form, heading in _SAFETY:
         if any(job.has_metric(metric, job.judged, scope) for job in jobs):
-            meaning = _MEANINGS[metric] if scope == TEST else "The same over full trajectories."
+            meaning = (
+                _MEANINGS[metric] if scope == wording.TEST else "The same over full trajectories."
+            )
             if not are_calibrations(jobs):
-                meaning += f" Below it the same for {explained(baseline)}."
+                meaning += f" Below it the same for {wording.explained(baseline)}."
             group = _IN_PLATOON if metric.startswith("platoon/") else _RECORDED
             cell = partial(_with_baseline, metric=metric, scope=scope, baseline=baseline, form=form)
             columns.append(Column(heading, cell, meaning, group))
@@ -193,12 +186,14 @@ def every_metric(jobs: Sequence[Result]) -> Sheet | None:
     """Returns a row per job with all metrics of the test part; None if no job lists its metrics."""
     known: dict[str, MetricInfo] = {}
     for job in jobs:
-        known |= {one.name: one for one in job.known_metrics if TEST in one.scopes}
+        known |= {one.name: one for one in job.known_metrics if wording.TEST in one.scopes}
     columns = [_JOB]
     for metric in known.values():
         better = "" if metric.direction == "none" else f" The {metric.direction} the better."
         meaning = f"{metric.meaning}, {metric.summary} over pairs.{better}"
-        cell = partial(_with_baseline, metric=metric.name, scope=TEST, baseline="fixed", form=".3g")
+        cell = partial(
+            _with_baseline, metric=metric.name, scope=wording.TEST, baseline="fixed", form=".3g"
+        )
         columns.append(Column(metric_title(metric), cell, meaning))
     return Sheet.of(columns, jobs) if known else None
 
@@ -243,7 +238,7 @@ def _gain(job: Result, baseline: str, scope: str) -> Cell:
     second = ""
     if math.isfinite(low) and math.isfinite(high):
         digits = 0 if max(abs(low), abs(high)) >= 1 else 1
-        ends = (percent(low, digits), percent(high, digits))
+        ends = (wording.percent(low, digits), wording.percent(high, digits))
         second = " to ".join(end.removesuffix(" %") for end in ends)
     return number(job.statistics(baseline, scope).geometric, "+.1%", second)
 
@@ -306,13 +301,15 @@ def over_seeds(rows: Sequence[Row]) -> Sheet:
     ]
     errors = "Test part: RMSE of speed in m/s"
     for method in methods_of(rows):
-        meaning = f"RMSE of speed over {where}, with {explained(method)}."
+        meaning = f"RMSE of speed over {where}, with {wording.explained(method)}."
         cell = partial(_error_over_seeds, method=method)
-        columns.append(Column(short_label(method), cell, meaning, errors))
+        columns.append(Column(wording.short_label(method), cell, meaning, errors))
     for baseline in baselines_of(rows):
-        meaning = f"Mean improvement of the RMSE of speed over {explained(baseline)}, test part."
+        meaning = (
+            f"Mean improvement of the RMSE of speed over {wording.explained(baseline)}, test part."
+        )
         heading, cell = (
-            f"over {short_label(baseline)}",
+            f"over {wording.short_label(baseline)}",
             partial(_gain_over_seeds, baseline=baseline),
         )
         columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
@@ -332,7 +329,7 @@ def _gain_over_seeds(row: Row, baseline: str) -> Cell:
 
 def _mean_and_range(values: np.ndarray, form: str) -> Cell:
     """Returns the mean, and below it the least and the largest value, where they differ."""
-    known = finite(values)
+    known = canvas.finite(values)
     if not len(known):
         return number(np.nan, form)
     ends = []

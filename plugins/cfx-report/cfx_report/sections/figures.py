@@ -8,18 +8,15 @@ from collections.abc import Mapping
 from typing import Any
 
 from cfx.plugin import (
-    ALL_TYPES,
-    OWN,
     Purpose,
     Result,
-    installed,
-    name_of_indicator,
-    percent,
-    plural,
-    short_label,
+    distributions,
+    pair_lines,  # pair_lines
+    registry,
+    style,
+    wording,
 )
-from cfx_report.figures.improvements import BASE_LABELS, history_curves
-from cfx_report.figures.trajectories import RankedPair, draw_pair, rank_pairs
+from cfx_report.figures.history import BASE_LABELS, history_curves
 from cfx_report.jobs import Runs, are_calibrations, of_purpose
 from cfx_report.section import MOST, Column, Section, Sheet, View, interval, job_names, number
 
@@ -61,7 +58,10 @@ class StyleSection(Section):
                 jobs.setdefault(scoring, []).append(job)
         named = len(jobs) > 1
         scorings = [(job_names(one) if named else "", "", one[0]) for one in jobs.values()]
-        by_site = [one for one in scorings if "style_distances" in one[2].tables]
+        by_site = []
+        for one in scorings:
+            if "style_distances" in one[2].tables:
+                by_site.append(one)
         rows: list[dict[str, Any]] = []
         for name, _, job in by_site:
             for row in job.tables["style_distances"].to_dict("records"):
@@ -72,7 +72,7 @@ class StyleSection(Section):
 
 def _group(row: Mapping[str, Any], prefix: str) -> str:
     site, kind = row[f"{prefix}site"], row[f"{prefix}driver_type"]
-    return str(site) if kind == ALL_TYPES else f"{site}, {kind}"
+    return str(site) if kind == style.ALL_TYPES else f"{site}, {kind}"
 
 
 _DISTANCES: tuple[Column[dict[str, Any]], ...] = (
@@ -91,7 +91,7 @@ _DISTANCES: tuple[Column[dict[str, Any]], ...] = (
     ),
     Column(
         "Differ most in",
-        lambda row: name_of_indicator(str(row["most"])),
+        lambda row: style.name_of_indicator(str(row["most"])),
         "The indicator whose normalised values, times its weight, are furthest apart.",
     ),
 )
@@ -117,7 +117,7 @@ class LearningSection(Section):
         for job in runs.jobs:
             table = job.tables.get("curves")
             if table is not None and len(table):
-                networks = plural(int(table["network"].nunique()), "network")
+                networks = wording.plural(int(table["network"].nunique()), "network")
                 learned.append((job.name, f"({networks})", job))
             elif table is not None:
                 without.append(job)
@@ -178,7 +178,7 @@ _AMOUNTS: tuple[Column[dict[str, Any]], ...] = (
 
 
 class FurtherSection(Section):
-    """Figures of other distributions that no section shows."""
+    """Figures of other distributions that a job has drawn and no section shows."""
 
     title = "Further figures"
     entry = "Further figures"
@@ -197,12 +197,16 @@ class FurtherSection(Section):
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return the figures."""
         shown: set[str] = set()
-        for section in installed("section"):
+        for section in registry.installed("section"):
             shown |= set(section.component.figures)
+        drawn: set[str] = set()
+        for job in runs.jobs:
+            drawn |= {path.stem for path in job.figures}
         further = []
-        for one in installed("figure"):
-            if one.distribution not in {OWN, "cfx-report"} and one.name not in shown:
-                further.append(one)
+        for figure in registry.installed("figure"):
+            is_other = figure.distribution not in {distributions.OWN, "cfx-report"}
+            if is_other and figure.name in drawn - shown:
+                further.append(figure)
         return {"further": further}
 
 
@@ -238,7 +242,10 @@ What lies outside a parameter's bounds is shaded.
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return the jobs that kept their trajectories, and what is shown of their pairs."""
-        jobs = [job for job in runs.jobs if "trajectories" in job.tables]
+        jobs = []
+        for job in runs.jobs:
+            if "trajectories" in job.tables:
+                jobs.append(job)
         constant = of_purpose(jobs, Purpose.CALIBRATION)
         shown = {
             "chosen": chosen_pairs,
@@ -250,7 +257,7 @@ What lies outside a parameter's bounds is shaded.
         return {"jobs": jobs, "adapting": adapting, "constant": bool(constant), **shown}
 
 
-def chosen_pairs(job: Result) -> tuple[RankedPair, ...]:
+def chosen_pairs(job: Result) -> tuple[pair_lines.RankedPair, ...]:
     """Returns the best, the median and the worst pair; fewer if there are fewer."""
     present = [trajectory.pair_id for trajectory in job.trajectories]
     table = job.by_pair[job.by_pair["pair_id"].isin(present)]
@@ -258,24 +265,25 @@ def chosen_pairs(job: Result) -> tuple[RankedPair, ...]:
         gains = -table[f"rmse_speed/{job.judged}"].to_numpy(dtype=float)
     else:
         gains = table["improvement/fixed"].to_numpy(dtype=float)
-    return rank_pairs(table["pair_id"].astype(str).tolist(), gains)
+    return pair_lines.rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
 def pair_of(job: Result, pair_id: str) -> dict[str, View]:
     """Speed, gap and each tuned parameter of one pair of a job."""
-    return {"": View(draw_pair(job, pair_id))}
+    return {"": View(pair_lines.draw_pair(job, pair_id))}
 
 
-def _title(job: Result, pair: RankedPair) -> str:
+def _title(job: Result, pair: pair_lines.RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
     if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
-        title += f": {percent(pair.improvement, 1)} over {short_label('fixed')} calibration"
+        improvement = wording.percent(pair.improvement, 1)
+        title += f": {improvement} over {wording.short_label('fixed')} calibration"
     return title
 
 
-def _errors_of_pair(job: Result, pair: RankedPair) -> str:
+def _errors_of_pair(job: Result, pair: pair_lines.RankedPair) -> str:
     row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
     errors = []
     for method in job.shown_methods:
-        errors.append(f"{short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
+        errors.append(f"{wording.short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
     return f"RMSE of speed (m/s): {', '.join(errors)}"

@@ -11,17 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from cfx.plugin import (
-    CLUSTERS,
-    Improvement,
-    Purpose,
-    Result,
-    explained,
-    method_label,
-    short_label,
-    without_folders,
-)
-from cfx_report.figures.improvements import improvement_axis, improvement_bars
+from cfx.plugin import Improvement, Purpose, Result, improvement_bars, job_folder, style, wording
 from cfx_report.figures.jobs import ClusterGroup, draw_clusters, draw_every_pair
 from cfx_report.jobs import Runs, any_baselines, of_purpose
 from cfx_report.names import SEPARATOR, differences
@@ -63,7 +53,7 @@ def per_driver(jobs: Sequence[Result]) -> dict[str, View]:
     tables = [_keyed(job, jobs) for job in jobs]
     views = {}
     for baseline in any_baselines(jobs):
-        views[f"against {method_label(baseline)}"] = _view(jobs, tables, baseline)
+        views[f"against {wording.method_label(baseline)}"] = _view(jobs, tables, baseline)
     return views
 
 
@@ -72,7 +62,7 @@ def _keyed(job: Result, jobs: Sequence[Result]) -> pd.DataFrame:
     table = job.by_pair.copy()
     keys = table["pair_id"].astype(str)
     if len({str(one.data.get("source", "")) for one in jobs}) > 1:
-        keys = keys + f" ({without_folders(str(job.data.get('source', '')))})"
+        keys = keys + f" ({job_folder.without_folders(str(job.data.get('source', '')))})"
     table["key"] = keys
     return table
 
@@ -86,7 +76,9 @@ def _view(jobs: Sequence[Result], tables: Sequence[pd.DataFrame], baseline: str)
             pair_ids.append(table["key"].tolist())
             improvements.append(table[column].to_numpy(dtype=float))
             marks += [getattr(job.statistics(baseline), statistic) for statistic in _STATISTICS]
-    bars = improvement_bars(names, pair_ids, improvements, baseline=baseline, marks=marks)
+    bars = improvement_bars.improvement_bars(
+        names, pair_ids, improvements, baseline=baseline, marks=marks
+    )
     # Best to worst of the first job; pairs that only others have follow.
     keys: dict[str, None] = {}
     for series in bars.series:
@@ -104,12 +96,15 @@ def pairs_of(job: Result) -> Sheet:
     ]
     for baseline in job.baselines():
         cell = partial(_value, f"improvement/{baseline}", form="+.1%")
-        heading, meaning = f"over {short_label(baseline)}", "Improvement of the RMSE of speed."
+        heading, meaning = (
+            f"over {wording.short_label(baseline)}",
+            "Improvement of the RMSE of speed.",
+        )
         columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
     errors = "RMSE of speed in m/s, below it of gap in m"
     for method in job.methods:
         cell = partial(_errors_of_pair, method)
-        columns.append(Column(short_label(method), cell, f"{errors}.", errors))
+        columns.append(Column(wording.short_label(method), cell, f"{errors}.", errors))
     return Sheet.of(columns, job.by_pair.to_dict("records"))
 
 
@@ -150,7 +145,9 @@ dashed one the mean; the dots are the pairs.</p>
             return None
         baselines = any_baselines(jobs)
         series = cluster_series(jobs)
-        sheets = {method_label(baseline): clusters(series, baseline) for baseline in baselines}
+        sheets = {
+            wording.method_label(baseline): clusters(series, baseline) for baseline in baselines
+        }
         return {"views": per_cluster(series, baselines), "sheets": sheets}
 
 
@@ -173,13 +170,13 @@ def cluster_series(jobs: Sequence[Result]) -> dict[str, dict[str, pd.DataFrame]]
         series.setdefault(name, {}).update(found)
     ordered = {}
     for name, by_cluster in series.items():
-        ordered[name] = {c: by_cluster[c] for c in CLUSTERS if c in by_cluster}
+        ordered[name] = {c: by_cluster[c] for c in style.CLUSTERS if c in by_cluster}
     return ordered
 
 
 def _by_cluster(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     found = {}
-    for cluster in CLUSTERS:
+    for cluster in style.CLUSTERS:
         rows = table[table["cluster"] == cluster]
         if len(rows):
             found[cluster] = rows
@@ -193,12 +190,17 @@ def per_cluster(series: Series, baselines: Sequence[str]) -> dict[str, View]:
         column = f"improvement/{baseline}"
         groups = []
         for name, by_cluster in series.items():
-            tables = [table for table in by_cluster.values() if column in table]
+            tables = []
+            for table in by_cluster.values():
+                if column in table:
+                    tables.append(table)
             if tables:
                 groups.append(_group(name, pd.concat(tables, ignore_index=True), column))
         every = np.concatenate([np.empty(0), *(group.values for group in groups)])
-        axis = improvement_axis(every, baseline=baseline)
-        views[f"against {method_label(baseline)}"] = View(draw_clusters(groups, axis), axis.note)
+        axis = improvement_bars.improvement_axis(every, baseline=baseline)
+        views[f"against {wording.method_label(baseline)}"] = View(
+            draw_clusters(groups, axis), axis.note
+        )
     return views
 
 
@@ -221,12 +223,14 @@ def clusters(series: Series, baseline: str) -> Sheet:
         for cluster, table in by_cluster.items():
             # Jobs without this baseline may stand beside others that have it.
             if f"rmse_speed/{baseline}" in table:
-                rows.append(_Row(name, cluster, statistics(table, baseline)))
+                rows.append(_Row(name, cluster, improvement_of(table, baseline)))
     columns: tuple[Column[_Row], ...] = (
         Column("Jobs", lambda row: row.jobs),
         Column(
             "Cluster",
-            lambda row: Cell(row.cluster, str(CLUSTERS.index(row.cluster)), colour=row.cluster),
+            lambda row: Cell(
+                row.cluster, str(style.CLUSTERS.index(row.cluster)), colour=row.cluster
+            ),
             "A quarter of the drivers, a half and a quarter by style score, unless the cuts say"
             " otherwise.",
         ),
@@ -237,19 +241,19 @@ def clusters(series: Series, baseline: str) -> Sheet:
         ),
     )
     shared = [replace(column, meaning="As above.") for column in STATISTICS[:5]]
-    shared[0] = replace(shared[0], meaning=f"Improvement over {explained(baseline)}.")
+    shared[0] = replace(shared[0], meaning=f"Improvement over {wording.explained(baseline)}.")
     return Sheet.of([*columns, *shared], rows)
 
 
-def statistics(table: pd.DataFrame, baseline: str) -> Improvement:
+def improvement_of(table: pd.DataFrame, baseline: str) -> Improvement:
     """Returns the statistics over some pairs, as an evaluation makes them.
 
     Args:
         table: some rows of `Result.by_pair`.
         baseline: what the policy is compared with.
     """
-    from cfx.plugin import improvement_statistics  # imports scipy
+    from cfx.plugin import statistics  # imports scipy
 
     before = table[f"rmse_speed/{baseline}"].to_numpy(dtype=float)
     after = table["rmse_speed/policy"].to_numpy(dtype=float)
-    return improvement_statistics(before, after, table["driver"].astype(str).tolist())
+    return statistics.improvement_statistics(before, after, table["driver"].astype(str).tolist())

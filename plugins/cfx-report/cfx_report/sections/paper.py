@@ -14,7 +14,7 @@ from importlib import resources
 from operator import itemgetter
 from typing import Any
 
-from cfx.plugin import Result, percent_or_undefined, plural, without_folders
+from cfx.plugin import Result, job_folder, wording
 from cfx_report.jobs import Runs
 from cfx_report.section import Cell, Column, Section, Sheet, number, text
 
@@ -41,7 +41,10 @@ class PaperSection(Section):
         paper = published()
         found = []
         for experiment, about in paper["experiments"].items():
-            jobs = [job for job in runs.jobs if job.setting("preset") == experiment]
+            jobs = []
+            for job in runs.jobs:
+                if job.setting("preset") == experiment:
+                    jobs.append(job)
             if "ranked" in about:
                 jobs = _ranked(jobs, about["ranked"])
             if jobs:
@@ -90,7 +93,7 @@ def value_of(job: Result, path: str) -> Any:
         "setting": job.setting,
         "metric": lambda *parts: job.metrics.get("/".join(parts), math.nan),
         "improvement": lambda name, over: getattr(job.statistics(over), name),
-        "source": lambda: without_folders(str(job.data.get("source", ""))),
+        "source": lambda: job_folder.without_folders(str(job.data.get("source", ""))),
         "pairs": job.pairs["pair_id"].nunique,
         "pair": lambda: _pair(job),
     }
@@ -101,7 +104,7 @@ def _pair(job: Result) -> str:
     """Return the numbers of a single pair, or how many there are."""
     table = job.pairs.drop_duplicates("pair_id")
     if len(table) > 1 or not {"follower_id", "leader_id"} <= set(table.columns):
-        return plural(len(table), "pair")
+        return wording.plural(len(table), "pair")
     return f"{table['follower_id'].iloc[0]}/{table['leader_id'].iloc[0]}"
 
 
@@ -111,7 +114,7 @@ def verdicts(about: Mapping[str, Any], jobs: Sequence[Result]) -> list[str]:
     if about["judged"]:
         gains = {job.name: float(value_of(job, about["judged"])) for job in jobs}
         for name, gain in gains.items():
-            said.append(f"{name}: mean of the ratios {percent_or_undefined(gain, 1)}.")
+            said.append(f"{name}: mean of the ratios {wording.percent_or_undefined(gain, 1)}.")
         known = [gain for gain in gains.values() if math.isfinite(gain)]
         if len(known) > 1:
             above = sum(gain > 0 for gain in known)

@@ -8,20 +8,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
-from cfx.plugin import (
-    FULL_TRAJECTORY,
-    MINUS,
-    OUTSIDE,
-    SCOPES,
-    TEST,
-    Improvement,
-    MetricInfo,
-    Purpose,
-    Result,
-    explained,
-    method_label,
-    short_label,
-)
+from cfx.plugin import OUTSIDE, SCOPES, Improvement, MetricInfo, Purpose, Result, wording
 from cfx_report.figures.jobs import draw_overview, statistics_axis
 from cfx_report.jobs import Runs, any_baselines, are_calibrations, metric_title, of_purpose
 from cfx_report.section import (
@@ -71,7 +58,7 @@ def overview(jobs: Sequence[Result]) -> dict[str, View]:
     """Mean improvement with its 95 % interval; a view per baseline and part of the trajectories."""
     views = {}
     for scope in SCOPES:
-        suffix = "" if scope == TEST else f", {jobs[0].scope_label(scope)}"
+        suffix = "" if scope == wording.TEST else f", {jobs[0].scope_label(scope)}"
         for baseline in any_baselines(jobs, scope):
             found = {}
             for job in jobs:
@@ -79,7 +66,7 @@ def overview(jobs: Sequence[Result]) -> dict[str, View]:
                     found[job.name] = job.statistics(baseline, scope)
             axis = statistics_axis(found.values(), baseline)
             drawn = draw_overview(found, baseline, axis)
-            views[f"against {method_label(baseline)}{suffix}"] = View(drawn, axis.note)
+            views[f"against {wording.method_label(baseline)}{suffix}"] = View(drawn, axis.note)
     return views
 
 
@@ -141,17 +128,17 @@ def errors(jobs: Sequence[Result]) -> Sheet:
                 "The same for the gap.",
             ),
         ]
-    if any_baselines(jobs, FULL_TRAJECTORY):
+    if any_baselines(jobs, wording.FULL_TRAJECTORY):
         columns += [
             Column(
                 "Full trajectory: RMSE of speed (m/s)",
-                partial(_metric, "rmse_speed", scope=FULL_TRAJECTORY),
+                partial(_metric, "rmse_speed", scope=wording.FULL_TRAJECTORY),
                 "The same over the full trajectory of unseen drivers, from its first frame on."
                 " Driver-specific calibration does not compete here.",
             ),
             Column(
                 "Full trajectory: RMSE of gap (m)",
-                partial(_metric, "rmse_gap", scope=FULL_TRAJECTORY),
+                partial(_metric, "rmse_gap", scope=wording.FULL_TRAJECTORY),
                 "The same for the gap.",
             ),
         ]
@@ -171,7 +158,7 @@ def errors(jobs: Sequence[Result]) -> Sheet:
     return Sheet.of(columns, rows)
 
 
-def _metric(name: str, row: _Tested, form: str = ".3f", scope: str = TEST) -> Cell:
+def _metric(name: str, row: _Tested, form: str = ".3f", scope: str = wording.TEST) -> Cell:
     return number(row.job.metric(name, row.method, scope), form)
 
 
@@ -192,8 +179,8 @@ class _Compared(NamedTuple):
 
 def improvements(jobs: Sequence[Result]) -> Sheet:
     """Returns the policy's improvement: a row per job, baseline and part of the trajectories."""
-    full = bool(any_baselines(jobs, FULL_TRAJECTORY))
-    scopes = (TEST, FULL_TRAJECTORY) if full else (TEST,)
+    full = bool(any_baselines(jobs, wording.FULL_TRAJECTORY))
+    scopes = (wording.TEST, wording.FULL_TRAJECTORY) if full else (wording.TEST,)
     baselines: list[str] = []
     for scope in scopes:
         baselines += any_baselines(jobs, scope)
@@ -222,7 +209,7 @@ def improvements(jobs: Sequence[Result]) -> Sheet:
 
 
 def _frames(row: _Compared) -> str:
-    said = "test part" if row.scope == TEST else "full trajectory"
+    said = "test part" if row.scope == wording.TEST else "full trajectory"
     return said.replace(" ", "\N{NO-BREAK SPACE}")
 
 
@@ -236,8 +223,9 @@ STATISTICS: tuple[Column[Any], ...] = (
     Column(
         "Improvement",
         lambda row: number(row.found.geometric, "+.1%"),
-        f"1 {MINUS} the geometric mean over drivers of RMSE of the policy / RMSE of the baseline,"
-        " RMSE of the speed over these frames. Above 0 the policy is closer to the real driver.",
+        f"1 {wording.MINUS} the geometric mean over drivers of RMSE of the policy / RMSE of the"
+        " baseline, RMSE of the speed over these frames. Above 0 the policy is closer to the real"
+        " driver.",
     ),
     Column(
         "95 % interval",
@@ -247,8 +235,8 @@ STATISTICS: tuple[Column[Any], ...] = (
     Column(
         "Of the mean errors",
         lambda row: number(row.found.ratio_of_means, "+.1%"),
-        f"1 {MINUS} mean RMSE of the policy / mean RMSE of the baseline: pairs with large errors"
-        " weigh most.",
+        f"1 {wording.MINUS} mean RMSE of the policy / mean RMSE of the baseline: pairs with large"
+        " errors weigh most.",
     ),
     Column(
         "Median",
@@ -416,7 +404,7 @@ def all_metrics(job: Result) -> Sheet:
     ]
     for method in methods:
         cell = partial(_value, job, method)
-        columns.append(Column(short_label(method), cell, explained(method)))
+        columns.append(Column(wording.short_label(method), cell, wording.explained(method)))
     columns.append(Column("Meaning", _meaning))
     rows = []
     for metric in job.known_metrics:

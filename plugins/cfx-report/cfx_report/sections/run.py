@@ -10,7 +10,7 @@ from typing import Any
 import pandas as pd
 import yaml
 
-from cfx.plugin import NOTHING, Purpose, Result, without_folders
+from cfx.plugin import Purpose, Result, job_folder, wording
 from cfx_report.jobs import Runs, are_calibrations
 from cfx_report.section import Column, Section, Sheet
 
@@ -41,7 +41,9 @@ class RunSection(Section):
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return what all jobs share, and a table of what they do not."""
-        unfinished = [(without_folders(one.place), one.reason) for one in runs.unfinished]
+        unfinished = [
+            (job_folder.without_folders(one.place), one.reason) for one in runs.unfinished
+        ]
         common, differing = facts(runs.jobs)
         return {"unfinished": unfinished, "common": common, "differing": differing}
 
@@ -66,7 +68,7 @@ class ConfigurationsSection(Section):
         """Return the place and the configuration of each job."""
         found = []
         for job in runs.jobs:
-            found.append((job.name, without_folders(job.place), _configuration(job)))
+            found.append((job.name, job_folder.without_folders(job.place), _configuration(job)))
         return {"configurations": found}
 
 
@@ -78,7 +80,7 @@ def _configuration(job: Result) -> str:
         for name, value in notes.items():
             design += f"# {str(name).replace('_', ' ')}: {value}\n"
     text = yaml.safe_dump(dict(job.config), sort_keys=False, allow_unicode=True)
-    return design + without_folders(str(text))
+    return design + job_folder.without_folders(str(text))
 
 
 def facts(jobs: Sequence[Result]) -> tuple[list[tuple[str, str]], Sheet | None]:
@@ -93,7 +95,7 @@ def facts(jobs: Sequence[Result]) -> tuple[list[tuple[str, str]], Sheet | None]:
     columns = [Column[Mapping[str, str]]("Job", itemgetter("Job"))]
     for name in names:
         for row in rows:
-            row.setdefault(name, NOTHING)
+            row.setdefault(name, wording.NOTHING)
         values = {row[name] for row in rows}
         if len(values) == 1:
             common.append((name, values.pop()))
@@ -125,23 +127,25 @@ def _facts(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
     if job.setting("preset"):
         found["Preset"] = job.setting("preset")
     return found | {
-        "Data": without_folders(str(job.data.get("source") or job.component("data") or NOTHING)),
+        "Data": job_folder.without_folders(
+            str(job.data.get("source") or job.component("data") or wording.NOTHING)
+        ),
         "Pairs": f"{len(table)} pairs of {table['driver'].nunique()} drivers",
         "Left out": _left_out(job),
         "Test frames of a pair": _range(table["frames"]),
-        "Drivers by style": str(job.setting("style.cluster") or NOTHING),
+        "Drivers by style": str(job.setting("style.cluster") or wording.NOTHING),
         "Protocol": _protocol(job),
-        "Driving model": job.component("model") or NOTHING,
+        "Driving model": job.component("model") or wording.NOTHING,
         **_policy(job, jobs),
         "Calibrated by": _calibration(job),
-        "Seed": str(job.config.get("seed", NOTHING)),
+        "Seed": str(job.config.get("seed", wording.NOTHING)),
         "cfx": job.version or "version not recorded",
-        "Read from": without_folders(job.place),
+        "Read from": job_folder.without_folders(job.place),
     }
 
 
 def _calibration(job: Result) -> str:
-    said = job.component("optimizer") or NOTHING
+    said = job.component("optimizer") or wording.NOTHING
     objective = job.data.get("objective")
     if isinstance(objective, Mapping):
         said += f", which minimises {objective.get('name')} ({objective.get('unit')})"
@@ -169,18 +173,21 @@ def _typed(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
             own.append(override)
     return {
         "Command": f"{_command(shared)} …",
-        "Overrides of its own": without_folders(shlex.join(own)) or "none",
+        "Overrides of its own": job_folder.without_folders(shlex.join(own)) or "none",
     }
 
 
 def _command(overrides: Sequence[str]) -> str:
     """Returns what was typed, without the folders of absolute paths."""
-    return without_folders(shlex.join(["python", "-m", "cfx", *overrides]))
+    return job_folder.without_folders(shlex.join(["python", "-m", "cfx", *overrides]))
 
 
 def _shared_overrides(jobs: Sequence[Result]) -> list[str]:
     """Returns the overrides that all jobs with known overrides have, in order."""
-    known = [job.overrides for job in jobs if job.overrides is not None]
+    known = []
+    for job in jobs:
+        if job.overrides is not None:
+            known.append(job.overrides)
     shared = []
     for override in known[0]:
         if all(override in other for other in known):

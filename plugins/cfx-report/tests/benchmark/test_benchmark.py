@@ -178,7 +178,7 @@ def test_a_row_of_other_pairs_is_made_and_marked(
     monkeypatch.chdir(tmp_path)
     path = tmp_path / "p.parquet"
     write_tidy(dataset("synthetic", pairs=6, frames=720, min_duration=0), path)
-    command = ["benchmark", "model=krauss", "tracking.enabled=false", "figures.enabled=false"]
+    command = ["benchmark", "model=krauss", "tracking.enabled=false", "figures=none"]
     command += ["--data", str(path), "--other-data", "--name", "krauss"]
     assert main(command) == 0
     folder = tmp_path / "outputs/benchmark/krauss"

@@ -10,13 +10,17 @@ from hypothesis import strategies as st
 
 from cfx.data.style import StyleResult
 from cfx.evaluation.tables import scope_label
-from cfx.figures.text import common_prefix, shortened
+from cfx.figures.wording import common_prefix, shortened
+from cfx.results.figures.improvement_bars import (
+    WORST_WITHOUT_CUT,
+    improvement_axis,
+    improvement_bars,
+)
+from cfx.results.figures.pair_lines import evenly_spread, rank_pairs
+from cfx.results.figures.parameter_spread import correlations, parameter_spreads, spread_offsets
 from cfx.results.result import ParameterAxis
-from cfx_report.figures.calibration import correlations, parameter_spreads, spread_offsets
-from cfx_report.figures.improvements import WORST_WITHOUT_CUT, improvement_axis, improvement_bars
 from cfx_report.figures.jobs import error_limit
 from cfx_report.figures.style import draw_style
-from cfx_report.figures.trajectories import evenly_spread, rank_pairs
 from cfx_report.runs import natural_order
 
 GAIN = st.floats(-50, 1) | st.sampled_from([np.nan, -np.inf])

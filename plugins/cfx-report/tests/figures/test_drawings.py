@@ -12,23 +12,28 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
+from cfx.core import registry
 from cfx.core.parameters import Parameter, ParameterSpace
 from cfx.errors import ConfigError, OutputError
 from cfx.evaluation.result import Evaluation, Purpose
+from cfx.figures.colours import COLOURS
 from cfx.figures.drawing import draw_figure, figure_named, write_figure, write_figures
-from cfx.figures.text import COLOURS, percent, pretty_unit, shortened, unit_label
+from cfx.figures.wording import percent, pretty_unit, shortened, unit_label
 from cfx.learners.curves import over_networks
+from cfx.results.figures.learning_curve import SAMPLED
+from cfx.results.figures.pair_lines import drives
 from cfx.results.result import Result
-from cfx_report.figures.improvements import amounts_of
-from cfx_report.figures.learning import SAMPLED
+from cfx_report.figures.history import amounts_of
 from cfx_report.figures.platoon import braking_time, worst_platoon
-from cfx_report.figures.trajectories import drives
 from tests.drawn import texts
 from tests.made_up import GAINS, MadeUp, make_history, make_platoon, make_results
 
 TEN = ParameterSpace.of(
     *(Parameter(f"p{k}", "m/s2", -2.0, 3.0 + k, 1.0, "made up") for k in range(10))
 )
+
+SHOWN = [one for one in registry.installed("figure") if one.distribution != "cfx-example"]
+"""All figures but the example's."""
 
 
 def all_of(made: MadeUp) -> Result:
@@ -78,7 +83,7 @@ def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
 )
 def test_every_size_of_job_is_drawn(tmp_path: Path, options: dict[str, Any], files: int) -> None:
     results = make_results(**options)
-    paths = write_figures(tmp_path / "figures", all_of(results))
+    paths = write_figures(tmp_path / "figures", all_of(results), SHOWN)
     assert len(paths) == files == len(list((tmp_path / "figures").iterdir()))
     for path in paths:
         height, width = imread(path).shape[:2]
@@ -184,7 +189,7 @@ def test_names_are_text_and_never_formulas(tmp_path: Path) -> None:
         trajectories=(dataclasses.replace(results.evaluation.trajectories[0], pair_id=name),),
     )
     odd = Result.of(evaluation, tables={"curves": results.curves})
-    assert len(write_figures(tmp_path, odd)) == 10
+    assert len(write_figures(tmp_path, odd, SHOWN)) == 10
 
 
 def test_cuts_and_cluster_sizes_stand_in_the_style_figure() -> None:
@@ -243,7 +248,7 @@ def test_a_path_that_cannot_be_written_is_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(
         OutputError, match=r"improvement_per_driver\.png: this figure cannot be written"
     ):
-        write_figures(tmp_path / "file" / "figures", all_of(results))
+        write_figures(tmp_path / "file" / "figures", all_of(results), SHOWN)
 
 
 def test_labels() -> None:
@@ -313,7 +318,7 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(
     platoon = make_platoon({"policy": 2})
     tables = {"curves": results.curves, "platoon": platoon.table, "history": history}
     every = Result.of(results.evaluation, tables=tables)
-    names = {path.name for path in write_figures(tmp_path, every)}
+    names = {path.name for path in write_figures(tmp_path, every, SHOWN)}
     assert {"platoon.png", "history.png"} <= names
     assert len(names) == 13
 

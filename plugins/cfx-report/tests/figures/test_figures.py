@@ -13,7 +13,7 @@ from matplotlib import pyplot as plt
 
 from cfx.core import registry
 from cfx.core.distributions import OWN
-from cfx.figures.canvas import canvas, hover
+from cfx.figures.canvas import blank, hover
 from cfx.figures.drawing import draw_figure, write_figure, write_figures
 from cfx.results.figure import JobFigure
 from cfx.results.result import Result
@@ -137,7 +137,7 @@ def test_a_figure_of_what_was_not_measured_is_left_out(one: registry.Installed[J
 
 
 def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_shows() -> None:
-    figure = canvas(3.0)
+    figure = blank(3.0)
     axes = figure.subplots()
     axes.scatter(np.arange(1000), np.arange(1000))
     (line,) = axes.plot([0, 1], [0, 1])
@@ -153,7 +153,7 @@ def test_an_inline_figure_has_text_pictures_of_clouds_and_says_what_the_mouse_sh
 
 
 FURTHER = """
-    from cfx.figures.canvas import canvas
+    from cfx.figures.canvas import blank
     from cfx.results.figure import JobFigure
 
     class Further(JobFigure):
@@ -164,7 +164,7 @@ FURTHER = """
         order = 5
 
         def draw(self, results):
-            return canvas(2.0)
+            return blank(2.0)
 
     class Broken(Further):
         def draw(self, results):
@@ -182,9 +182,12 @@ def test_a_third_partys_figure_needs_a_class_and_an_entry_point(
     figures = {
         name.lower(): f"further_figures:{name}" for name in ("Further", "Broken", "Untitled")
     }
-    figures |= {"drives": "further_figures:Further", "missing": "no_such_module:Figure"}
+    figures |= {"following": "further_figures:Further", "missing": "no_such_module:Figure"}
     install("somebody-else", {"cfx.figures": figures}, {"further_figures.py": FURTHER})
     write_job(tmp_path / "job", pairs=3)
+    drawn = tmp_path / "job" / "figures" / "further.png"
+    drawn.parent.mkdir(exist_ok=True)
+    drawn.touch()
     names = [one.name for one in registry.installed("figure")]
     made = make_results(pairs=1, frames=5)
     paths = write_figures(tmp_path / "figures", Result.of(made.evaluation))
@@ -194,9 +197,9 @@ def test_a_third_partys_figure_needs_a_class_and_an_entry_point(
     written = [path.stem for path in paths]
     assert written[0] == "further"
     assert "broken" not in written
-    assert "drives" not in written, "two of a name: neither is drawn, and a warning names both"
+    assert "following" not in written, "two of a name: neither is drawn, and a warning names both"
     assert page.count("Something further") == 2, "its heading, and the words for who sees none"
-    for name in ("broken", "drives", "missing", "untitled"):
+    for name in ("broken", "following", "missing", "untitled"):
         assert f"figure {name} of the distribution somebody-else is left out" in caplog.text
     assert (
         "broken of the distribution somebody-else is left out: ValueError: no luck" in caplog.text

@@ -13,7 +13,7 @@ from cfx.app import cli
 from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.errors import ConfigError
-from cfx.figures.canvas import Paper, canvas, on_paper, points, side_by_side, wrapped
+from cfx.figures.canvas import Paper, blank, on_paper, points, side_by_side, wrapped
 from cfx.figures.drawing import draw_figure, figure_named
 from cfx.results.result import Result
 from tests.job_folders import write_job
@@ -46,11 +46,11 @@ def test_no_text_of_any_figure_is_larger_than_the_paper_asks_for(results: Result
 
 
 def test_panels_stand_below_each_other_where_text_has_no_room() -> None:
-    usual = canvas(3.0)
+    usual = blank(3.0)
     left, right = side_by_side(usual, (2, 1))
     assert left.get_subplotspec().colspan != right.get_subplotspec().colspan
     with on_paper(COLUMN):
-        narrow = canvas(3.0)
+        narrow = blank(3.0)
         above, below = side_by_side(narrow, (2, 1))
         assert above.get_subplotspec().colspan == below.get_subplotspec().colspan
         assert narrow.get_figheight() == pytest.approx(2 * 3.0 * 8 / 10.5)

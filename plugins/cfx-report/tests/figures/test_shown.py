@@ -9,15 +9,11 @@ import numpy as np
 import pytest
 
 from cfx.evaluation.result import Evaluation
-from cfx.figures.text import colour_of
+from cfx.figures.colours import colour_of
 from cfx.learners.curves import over_networks
-from cfx.results.result import Result
-from cfx_report.figures.calibration import correlations, draw_calibration, parameter_spreads
-from cfx_report.figures.improvements import draw_improvements, improvement_bars
-from cfx_report.figures.jobs import draw_every_pair
-from cfx_report.figures.learning import draw_learning, loss_quartiles
-from cfx_report.figures.platoon import braking_time, draw_platoons, worst_platoon
-from cfx_report.figures.trajectories import (
+from cfx.results.figures.improvement_bars import draw_improvements, improvement_bars
+from cfx.results.figures.learning_curve import draw_learning, loss_quartiles
+from cfx.results.figures.pair_lines import (
     PairPanels,
     draw_pair,
     draw_pairs,
@@ -26,6 +22,10 @@ from cfx_report.figures.trajectories import (
     pair_panels,
     rank_pairs,
 )
+from cfx.results.figures.parameter_spread import correlations, draw_calibration, parameter_spreads
+from cfx.results.result import Result
+from cfx_report.figures.jobs import draw_every_pair
+from cfx_report.figures.platoon import braking_time, draw_platoons, worst_platoon
 from cfx_report.runs import read_runs
 from cfx_report.sections.figures import chosen_pairs
 from tests.drawn import drawn_lines

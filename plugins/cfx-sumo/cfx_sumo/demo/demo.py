@@ -17,7 +17,7 @@ from typing import Any, ClassVar
 import pandas as pd
 from pydantic import Field
 
-from cfx.plugin import DEMO_PAGE, Agent, Demo, Evaluation, PairSet, Settings, atomic_write
+from cfx.plugin import DEMO_PAGE, Agent, Demo, Evaluation, PairSet, Settings, files
 from cfx_sumo.demo.motorway import read_motorway
 from cfx_sumo.demo.simulated import (
     FinishedJob,
@@ -90,7 +90,7 @@ class SumoDemo(Demo):
         with tempfile.TemporaryDirectory(prefix="cfx-sumo-") as scratch:
             road = read_motorway(self.settings.osm, Path(scratch))
             simulated = simulate_in_sumo(job, road, self.settings.pairs)
-            with atomic_write(folder / "motorway.net.xml") as partial:
+            with files.atomic_write(folder / "motorway.net.xml") as partial:
                 shutil.copyfile(road.net, partial)
         _write_errors(folder / "demo_rmse.csv", simulated)
         in_sumo = evaluation_in_sumo(evaluation, simulated)
@@ -102,7 +102,7 @@ class SumoDemo(Demo):
 def _write_errors(path: Path, simulated: Sequence[SimulatedPair]) -> None:
     """Writes the errors of the pairs in SUMO beside those in memory."""
     table = pd.concat([one.table for one in simulated], ignore_index=True)
-    with atomic_write(path) as partial:
+    with files.atomic_write(path) as partial:
         table.to_csv(partial, index=False)
     log.info(
         "SUMO: %d pairs as in memory; largest difference of a speed %.1g m/s, of a gap %.1g m",

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from cfx.plugin import COLOURS, Agent, Evaluation, Result, atomic_write, method_label
+from cfx.plugin import Agent, Evaluation, Result, colours, files, wording
 from cfx_report.inline import embedded_json, inline_scripts, security_policy
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
@@ -40,7 +40,7 @@ def write_page(
         OSError: the page cannot be written.
     """
     page = render(road, simulated, evaluation, policy, source)
-    with atomic_write(path) as partial:
+    with files.atomic_write(path) as partial:
         partial.write_text(page, encoding="utf-8")
     return path
 
@@ -68,8 +68,8 @@ def render(
         security=security_policy(scripts),
         scripts=scripts,
         style=_asset("demo.css"),
-        colours={kind: COLOURS[kind] for kind in vehicles},
-        labels={kind: method_label(kind) for kind in vehicles},
+        colours={kind: colours.COLOURS[kind] for kind in vehicles},
+        labels={kind: wording.method_label(kind) for kind in vehicles},
         content=embedded_json(_content(road, simulated, plots)),
         simulated=simulated,
         plots=plots,
@@ -103,8 +103,8 @@ def _content(
         shape = _rounded(100 * (lane.shape - corner))
         lanes.append({"width": lane.width, "inner": lane.inner, "shape": shape})
     return {
-        "colours": {kind: COLOURS[kind] for kind in ("leader", *FOLLOWERS)},
-        "labels": {kind: method_label(kind) for kind in FOLLOWERS},
+        "colours": {kind: colours.COLOURS[kind] for kind in ("leader", *FOLLOWERS)},
+        "labels": {kind: wording.method_label(kind) for kind in FOLLOWERS},
         "followers": FOLLOWERS,
         "carLength": CAR_LENGTH,
         "lanes": lanes,
@@ -149,13 +149,13 @@ class _Plot(NamedTuple):
 
 def _plots(evaluation: Evaluation) -> list[_Plot]:
     """Draws each pair; the axes' places are where the page puts its line of time."""
-    from cfx_report.figures.trajectories import draw_pair
+    from cfx.plugin import pair_lines  # pair_lines
     from cfx_report.inline import PLACE, inline_svg
 
     result = Result.of(evaluation)
     found = []
     for k, trajectory in enumerate(evaluation.trajectories):
-        figure = draw_pair(result, trajectory.pair_id)
+        figure = pair_lines.draw_pair(result, trajectory.pair_id)
         svg = inline_svg(figure).replace(PLACE, f"plot-{k}-")
         axes = []
         for one in figure.axes:

@@ -11,18 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyBboxPatch, Patch
 from matplotlib.transforms import Affine2D
 
-from cfx.plugin import (
-    COLOURS,
-    INK,
-    Evaluation,
-    Result,
-    canvas,
-    method_label,
-    shortened,
-    styled,
-    write_figure,
-)
-from cfx_report.figures.trajectories import drives
+from cfx.plugin import Evaluation, Result, canvas, colours, drawing, pair_lines, wording
 from cfx_sumo.demo.motorway import Motorway
 from cfx_sumo.demo.replay import CAR_LENGTH, FOLLOWERS
 from cfx_sumo.demo.simulated import Array, SimulatedPair
@@ -48,13 +37,16 @@ def write_pictures(
         OutputError: a file cannot be written.
     """
     middle = simulated[len(simulated) // 2]
-    together = [one for one in simulated if one.scene == middle.scene]
-    picture = write_figure(snapshots(road, middle, together), folder / "demo.png")
-    trajectories = drives(Result.of(evaluation), [one.pair.pair_id for one in simulated])
-    return [picture, write_figure(trajectories, folder / "demo_drives.png")]
+    together = []
+    for one in simulated:
+        if one.scene == middle.scene:
+            together.append(one)
+    picture = drawing.write_figure(snapshots(road, middle, together), folder / "demo.png")
+    trajectories = pair_lines.drives(Result.of(evaluation), [one.pair.pair_id for one in simulated])
+    return [picture, drawing.write_figure(trajectories, folder / "demo_drives.png")]
 
 
-@styled
+@canvas.styled
 def snapshots(road: Motorway, main: SimulatedPair, together: Sequence[SimulatedPair]) -> Figure:
     """The road from above, driving upwards, at three moments.
 
@@ -68,7 +60,7 @@ def snapshots(road: Motorway, main: SimulatedPair, together: Sequence[SimulatedP
     frames = np.linspace(main.first, len(main.pair) - 1, _MOMENTS).round().astype(int)
     span = max(_reach(main, int(frame)) for frame in frames) + 4 * CAR_LENGTH
     width = max(26.0, 0.4 * span)
-    figure = canvas(1.3 + 2.9 * span / width, width=9.0)
+    figure = canvas.blank(1.3 + 2.9 * span / width, width=9.0)
     for axes, frame in zip(figure.subplots(1, _MOMENTS), frames, strict=True):
         view = _View.of(main, together, int(frame), width)
         _draw_road(axes, road, view)
@@ -85,8 +77,8 @@ def snapshots(road: Motorway, main: SimulatedPair, together: Sequence[SimulatedP
         axes.spines[["left", "bottom"]].set_visible(False)
     handles = []
     for kind in ("leader", *FOLLOWERS):
-        handles.append(Patch(color=COLOURS[kind], label=method_label(kind)))
-    name = shortened(main.pair.pair_id, 50)
+        handles.append(Patch(color=colours.COLOURS[kind], label=wording.method_label(kind)))
+    name = wording.shortened(main.pair.pair_id, 50)
     figure.legend(
         handles=handles,
         loc="outside upper center",
@@ -164,8 +156,8 @@ def _draw_pair(axes: Axes, one: SimulatedPair, frame: int, view: _View, *, named
     for kind in FOLLOWERS:
         leader, follower = one.place[kind][frame]
         shade = 1.0 if named else 0.45
-        _car(axes, leader, one.pair.leader_length, COLOURS["leader"], view, shade)
-        _car(axes, follower, CAR_LENGTH, COLOURS[kind], view, shade)
+        _car(axes, leader, one.pair.leader_length, colours.COLOURS["leader"], view, shade)
+        _car(axes, follower, CAR_LENGTH, colours.COLOURS[kind], view, shade)
         front, rear = view(follower[:2]), view(leader[:2]) - [0, one.pair.leader_length]
         axes.plot(
             [front[0], rear[0]],
@@ -184,7 +176,7 @@ def _draw_pair(axes: Axes, one: SimulatedPair, frame: int, view: _View, *, named
                 ha="center",
                 va="top",
                 fontsize=6.5,
-                color=INK,
+                color=colours.INK,
                 zorder=6,
                 bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.85, "pad": 0.6},
                 clip_on=True,

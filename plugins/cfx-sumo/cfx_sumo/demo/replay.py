@@ -214,7 +214,10 @@ def _simulate(
         try:
             for frame in range(max(road.frames for road in roads)):
                 sumo.simulationStep()
-                present = [road for road in roads if frame < road.frames]
+                present = []
+                for road in roads:
+                    if frame < road.frames:
+                        present.append(road)
                 _frame(sumo, present, frame, drivers, chosen)
         finally:
             sumo.close()

@@ -25,9 +25,9 @@ from cfx.plugin import (
     PairSet,
     PairTrajectory,
     driver_features_of,
+    pair_lines,
     worker_pool,
 )
-from cfx_report.figures.trajectories import evenly_spread
 from cfx_sumo.demo.motorway import ABREAST, Motorway
 from cfx_sumo.demo.replay import FOLLOWERS, ReplayRequest, replay
 from cfx_sumo.installed import require_sumo
@@ -150,7 +150,7 @@ def _choose(
         trajectories, key=lambda trajectory: -improvement.get(trajectory.pair_id, -np.inf)
     )
     # A demonstration of one pair shows the best.
-    places = evenly_spread(len(ranked), count) if count > 1 else [0]
+    places = pair_lines.evenly_spread(len(ranked), count) if count > 1 else [0]
     return [ranked[place] for place in places]
 
 

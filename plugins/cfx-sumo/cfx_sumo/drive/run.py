@@ -23,7 +23,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
-from cfx.plugin import Task, atomic_write
+from cfx.plugin import Task, files
 from cfx_sumo.drive.distributions import members_of
 from cfx_sumo.drive.left_out import left_out
 from cfx_sumo.drive.scenarios import SCENARIOS
@@ -533,7 +533,10 @@ class _Run:
         known = self._sumo.vehicletype.getIDList()
         for name in self._fleet.drivers:
             if name not in known:
-                own = [one for one in known if not one.startswith("DEFAULT_")]
+                own = []
+                for one in known:
+                    if not one.startswith("DEFAULT_"):
+                        own.append(one)
                 raise SumoError(
                     f"{self._scenario} has no vType '{name}'.{nearest(name, own)} It has:"
                     f" {', '.join(own) or 'none of its own'}. (A vType must stand ahead of the"
@@ -543,10 +546,12 @@ class _Run:
     def _name_members(self) -> None:
         """Lets the driver of a vTypeDistribution drive the vTypes that are its members."""
         get_option = self._sumo.simulation.getOption
-        files = []
+        sumo_files = []
         for option in ("additional-files", "route-files"):
-            files += [Path(name.strip()) for name in get_option(option).split(",") if name.strip()]
-        for name, members in members_of(self._fleet.drivers, files).items():
+            for name in get_option(option).split(","):
+                if name.strip():
+                    sumo_files.append(Path(name.strip()))
+        for name, members in members_of(self._fleet.drivers, sumo_files).items():
             for member in members:
                 if member in self._fleet.drivers:
                     raise SumoError(
@@ -753,7 +758,7 @@ class _Rows:
             raise OutputError(f"{path} is a folder; name a file in --output")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            partial = stack.enter_context(atomic_write(path))
+            partial = stack.enter_context(files.atomic_write(path))
             file = stack.enter_context(partial.open("w", newline="", encoding="utf-8"))
         except OSError as error:
             raise OutputError(
@@ -805,11 +810,11 @@ def parse_drivers(given: Sequence[str]) -> dict[str, str]:
 
 def report(run: ScenarioRun) -> None:
     """Prints what happened: tables, and one line about speed."""
-    from cfx.plugin import print_table
+    from cfx.plugin import console
 
-    print_table(_what_happened(run))
-    print_table(_braking(run))
-    print_table(_beside_the_recording(run))
+    console.print_table(_what_happened(run))
+    console.print_table(_braking(run))
+    console.print_table(_beside_the_recording(run))
     for collision in run.collisions[:_LISTED]:
         print(collision)
     if len(run.collisions) > _LISTED:
@@ -908,9 +913,9 @@ def _beside_the_recording(run: ScenarioRun) -> Table:
 
 
 def _table(*columns: str) -> Table:
-    from cfx.plugin import blank_table
+    from cfx.plugin import console
 
-    table = blank_table(*columns)
+    table = console.blank_table(*columns)
     for column in table.columns[1:]:
         column.justify = "right"
     return table

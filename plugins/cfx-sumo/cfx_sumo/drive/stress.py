@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from cfx.errors import SumoError
-from cfx.plugin import Task, write_json
+from cfx.plugin import Task, files
 from cfx_sumo.drive.queue import SECONDS, QueueAtLight, queue_of
 from cfx_sumo.drive.run import command_line, started
 from cfx_sumo.drive.scenarios import ASSETS, CAR, SCENARIOS, STEP_S, Scenario
@@ -208,9 +208,9 @@ def run_town(
 
 def report_stress(result: StressResult, output: Path | None = None) -> None:
     """Prints a table of the events, and writes it as JSON where `output` is given."""
-    from cfx.plugin import blank_table, print_table
+    from cfx.plugin import console
 
-    table = blank_table(
+    table = console.blank_table(
         "event",
         "number",
         "headway at first [s]",
@@ -233,7 +233,7 @@ def report_stress(result: StressResult, output: Path | None = None) -> None:
             f"{one.hardest_acceleration:.2f}",
             f"{one.smallest_gap:.2f}",
         )
-    print_table(table)
+    console.print_table(table)
     town = result.town
     print(
         f"A queue at a light lets {town.saturation_flow:.0f} vehicles through an hour of green and"
@@ -242,7 +242,7 @@ def report_stress(result: StressResult, output: Path | None = None) -> None:
         " learned from."
     )
     if output is not None:
-        write_json(output, result.to_json())
+        files.write_json(output, result.to_json())
 
 
 def _range(headway: tuple[float, float, float] | None) -> str:

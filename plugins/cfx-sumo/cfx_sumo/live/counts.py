@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from cfx.plugin import Agent, share_in_words
+from cfx.plugin import Agent, valid_range
 
 _OBEYED_MPS = 1e-3
 """A speed this close to what SUMO was told is what it was told."""
@@ -62,4 +62,4 @@ class DriveCounts:
         """Returns how much was driven outside what the policy has learned, in words; or ""."""
         if policy.valid_range is None or self.beyond is None:
             return ""
-        return share_in_words(policy.valid_range, self.outside, self.steps, self.beyond)
+        return valid_range.share_in_words(policy.valid_range, self.outside, self.steps, self.beyond)

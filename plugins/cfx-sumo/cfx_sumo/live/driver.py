@@ -26,9 +26,9 @@ from cfx.plugin import (
     ANY_DRIVER,
     Agent,
     DrivingModel,
-    create,
-    one_thread,
+    registry,
     require_no_further_signals,
+    threads,
 )
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
@@ -153,7 +153,7 @@ class Driver:
         self.policy = policy
         self.look_ahead = look_ahead
         self.source = source
-        self.model = model or cast(DrivingModel, create("model", policy.model_node))
+        self.model = model or cast(DrivingModel, registry.create("model", policy.model_node))
         check_model(self.model, policy.model_node["name"], source)
         self.counts = DriveCounts()
         self._assignments = Assignments(policy, network, source)
@@ -302,7 +302,7 @@ class Driver:
         return dict(zip(self.policy.space.names, table.parameters[row].tolist(), strict=True))
 
     @torch.no_grad()
-    @one_thread()
+    @threads.one_thread()
     def step(
         self, connection: Connection, vehicles: str | Iterable[str], *, drive: bool = True
     ) -> None:

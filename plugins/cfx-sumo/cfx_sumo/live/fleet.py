@@ -9,7 +9,7 @@ from typing import Unpack
 import torch
 
 from cfx.errors import DataError
-from cfx.plugin import ANY_DRIVER, one_thread
+from cfx.plugin import ANY_DRIVER, threads
 from cfx_sumo.live.driver import Driver, DriverOptions, Together
 from cfx_sumo.live.saved import read_state, write_state
 from cfx_sumo.live.surroundings import Connection
@@ -80,7 +80,7 @@ class Fleet:
         return {vehicle: name for vehicle, name in self._type_of.items() if name in self.drivers}
 
     @torch.no_grad()
-    @one_thread()
+    @threads.one_thread()
     def step(self, connection: Connection) -> None:
         """Sets the speeds of the fleet's vehicles in the next `simulationStep`.
 

@@ -17,8 +17,8 @@ from cfx.plugin import (
     Scaler,
     WindowSettings,
     folder_of,
+    job_folder,
     load_agent,
-    parse_json,
 )
 
 
@@ -33,7 +33,7 @@ def load_policy(run: str | Path) -> Agent:
     if not (folder / "policy.json").is_file():
         folder /= "policy"
     policy = load_agent(folder)
-    written = parse_json((folder / "policy.json").read_text(encoding="utf-8"))
+    written = job_folder.parse_json((folder / "policy.json").read_text(encoding="utf-8"))
     trained = written.get("parameters", [])
     if tuple(trained) != policy.space.names:
         raise DataError(

@@ -16,7 +16,7 @@ from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
 from cfx.errors import DataError, OutputError
-from cfx.plugin import atomic_write
+from cfx.plugin import files
 
 _KEY = "cfx_live_drivers"
 """Of the description in the file's metadata."""
@@ -60,7 +60,7 @@ def write_state(
     }
     content = safetensors.torch.save(tensors, {_KEY: json.dumps(described)})
     try:
-        with atomic_write(path) as temporary:
+        with files.atomic_write(path) as temporary:
             temporary.write_bytes(content)
     except OSError as error:
         raise OutputError(

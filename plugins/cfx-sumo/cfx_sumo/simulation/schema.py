@@ -13,7 +13,7 @@ from pathlib import Path
 from xml.etree import ElementTree
 
 from cfx.errors import ConfigError, SumoError, nearest
-from cfx.plugin import VType, install_line
+from cfx.plugin import VType, distributions
 from cfx_sumo.installed import DISTRIBUTION
 
 _XS = "{http://www.w3.org/2001/XMLSchema}"
@@ -76,7 +76,8 @@ def car_following() -> dict[str, frozenset[str]]:
         if path.is_file():
             return _read(path)
     raise SumoError(
-        "SUMO's schema (the package sumo-data) is not there: " + install_line(DISTRIBUTION)
+        "SUMO's schema (the package sumo-data) is not there: "
+        + distributions.install_line(DISTRIBUTION)
     )
 
 

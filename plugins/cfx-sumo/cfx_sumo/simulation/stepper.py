@@ -20,8 +20,8 @@ from cfx.plugin import (
     Stepper,
     VType,
     content_key,
-    cores,
     folder_hash,
+    threads,
 )
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.limits import lost_limits
@@ -88,7 +88,7 @@ class SumoStepper(Stepper):
                 "simulator=sumo: SUMO counts in milliseconds, so it cannot take the recording's"
                 f" steps of {dt:g} s"
             )
-        self._session = Session(workers or cores())
+        self._session = Session(workers or threads.cores())
 
     def identity(self) -> str:
         return content_key(

@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cfx.errors import SumoError
-from cfx.plugin import install_line
+from cfx.plugin import distributions
 from cfx_sumo.installed import DISTRIBUTION
 from cfx_sumo.simulation.network import FOLLOWER, LANE, LEADER, ROAD, Placed, network, routes
 
@@ -221,7 +221,9 @@ def answer(number: int, request: Request) -> Answer:
     try:
         return Answer(number, *_ROADS[0].simulate(request))
     except ImportError as error:
-        raise SumoError(f"SUMO cannot be loaded ({error}): {install_line(DISTRIBUTION)}") from None
+        raise SumoError(
+            f"SUMO cannot be loaded ({error}): {distributions.install_line(DISTRIBUTION)}"
+        ) from None
     except Exception as error:  # libsumo's errors have no common base
         if not type(error).__module__.startswith("libsumo"):
             raise

@@ -47,7 +47,7 @@ JOB = (
     "data.frames=200",
     "data.max_pairs=null",
     "cache.enabled=false",
-    "figures.enabled=false",
+    "figures=none",
     "tracking.enabled=false",
     "hydra.run.dir=job",
 )

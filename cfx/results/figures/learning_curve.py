@@ -2,51 +2,44 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter
 
-from cfx.plugin import (
-    EDGE,
-    TRAIN_COLOUR,
-    VALIDATION_COLOUR,
-    Array,
-    JobFigure,
-    Result,
-    canvas,
-    first_sampled_epoch,
-    legend_above,
-    over_networks,
-    plain_tick,
-    styled,
-    write_note,
-)
+from cfx.figures import canvas, colours
+from cfx.learners import curves
+from cfx.results.figure import JobFigure
+
+if TYPE_CHECKING:
+    from cfx.results.result import Result
 
 LOSS_TITLE = "loss (as the learner defines it)"
 SAMPLED = "training counts sampled paths, too (CRPS)"
 """What the training loss has from the first sampled epoch on."""
 
 _COLUMNS = {
-    "train_loss": ("training", TRAIN_COLOUR, "solid"),
-    "validation_loss": ("validation", VALIDATION_COLOUR, (0, (5.0, 1.8))),
+    "train_loss": ("training", colours.TRAIN_COLOUR, "solid"),
+    "validation_loss": ("validation", colours.VALIDATION_COLOUR, (0, (5.0, 1.8))),
 }
 _MOST_POINTS = 250
 _LOGARITHMIC_FROM = 5.0
 
 
-def loss_quartiles(curves: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def loss_quartiles(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     """Return quartiles over the networks of each loss that was measured.
 
     Args:
-        curves: columns `network`, `epoch`, `train_loss`, `validation_loss`; NaN where not measured.
+        table: columns `network`, `epoch`, `train_loss`, `validation_loss`; NaN where not measured.
 
     Returns:
-        By column of `curves`; a row per epoch, columns 0.25, 0.5 and 0.75.
+        By column of `table`; a row per epoch, columns 0.25, 0.5 and 0.75.
     """
     found = {}
     for column in _COLUMNS:
-        losses = over_networks(curves, column)
+        losses = curves.over_networks(table, column)
         if not losses.empty:
             count = min(_MOST_POINTS, len(losses))
             kept = np.unique(np.linspace(0, len(losses) - 1, count).round().astype(int))
@@ -54,7 +47,7 @@ def loss_quartiles(curves: pd.DataFrame) -> dict[str, pd.DataFrame]:
     return found
 
 
-def _logarithmic_ticks(values: Array) -> list[float]:
+def _logarithmic_ticks(values: canvas.Array) -> list[float]:
     """Return ticks where all losses are positive and span more than a factor of five."""
     if not len(values):
         return []
@@ -69,17 +62,17 @@ def _logarithmic_ticks(values: Array) -> list[float]:
     return ticks
 
 
-@styled
-def draw_learning(curves: pd.DataFrame) -> Figure:
+@canvas.styled
+def draw_learning(table: pd.DataFrame) -> Figure:
     """Draw training and validation loss per epoch: median over the networks, and quartiles.
 
     Args:
-        curves: as for `loss_quartiles`; `sampled_paths` where a head draws.
+        table: as for `loss_quartiles`; `sampled_paths` where a head draws.
     """
-    figure = canvas(3.9)
+    figure = canvas.blank(3.9)
     axes = figure.subplots()
-    networks = int(curves["network"].nunique())
-    losses = loss_quartiles(curves)
+    networks = int(table["network"].nunique())
+    losses = loss_quartiles(table)
     for column, quartiles in losses.items():
         label, colour, dash = _COLUMNS[column]
         epochs = quartiles.index.to_numpy(dtype=float)
@@ -96,27 +89,27 @@ def draw_learning(curves: pd.DataFrame) -> Figure:
         if networks > 1:
             low, high = quartiles[0.25], quartiles[0.75]
             axes.fill_between(epochs, low, high, color=colour, alpha=0.25, linewidth=0)
-    sampled_from = first_sampled_epoch(curves)
+    sampled_from = curves.first_sampled_epoch(table)
     if sampled_from is not None:
         dash = (0, (4, 2))
-        axes.axvline(sampled_from, color=EDGE, linewidth=0.9, linestyle=dash, label=SAMPLED)
+        axes.axvline(sampled_from, color=colours.EDGE, linewidth=0.9, linestyle=dash, label=SAMPLED)
     ends = [one[[0.25, 0.75]].to_numpy(dtype=float).ravel() for one in losses.values()]
     ticks = _logarithmic_ticks(np.concatenate([np.empty(0), *ends]))
     if ticks:
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(FixedLocator(ticks))
-        axes.yaxis.set_major_formatter(FuncFormatter(plain_tick))
+        axes.yaxis.set_major_formatter(FuncFormatter(canvas.plain_tick))
         axes.yaxis.set_minor_formatter(NullFormatter())
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("epoch")
     axes.set_ylabel(LOSS_TITLE)
     axes.margins(x=0.01)
     if not losses:
-        write_note(axes, "no loss was measured")
+        canvas.write_note(axes, "no loss was measured")
     elif len(next(iter(losses.values()))) == 1:
-        axes.set_xticks([int(curves["epoch"].iloc[0])])
+        axes.set_xticks([int(table["epoch"].iloc[0])])
     title = f"{networks} networks: median and quartiles" if networks > 1 else "one network"
-    legend_above(figure, title=title)
+    canvas.legend_above(figure, title=title)
     return figure
 
 

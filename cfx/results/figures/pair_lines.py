@@ -6,7 +6,7 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -17,33 +17,25 @@ from matplotlib.ticker import MaxNLocator
 from numpy.typing import NDArray
 
 from cfx.errors import ConfigError, nearest
-from cfx.plugin import (
-    BAND,
-    EDGE,
-    HIDDEN,
-    INK,
-    Array,
-    JobFigure,
-    Line,
-    PairTrajectory,
-    ParameterAxis,
-    Result,
-    canvas,
-    colour_of,
-    draw_lines,
-    finite,
-    method_label,
-    method_legend,
-    most_across,
-    number_text,
-    percent,
-    points,
-    short_label,
-    shortened,
-    styled,
-    unit_label,
-)
-from cfx_report.figures.improvements import improvement_title
+from cfx.figures import canvas, colours, wording
+from cfx.results.figure import JobFigure
+from cfx.results.figures.improvement_bars import improvement_title
+
+if TYPE_CHECKING:
+    from cfx.evaluation.result import PairTrajectory
+    from cfx.results.result import ParameterAxis, Result
+
+__all__ = [
+    "TIME_TITLE",
+    "RankedPair",
+    "chosen_pairs",
+    "draw_pair",
+    "drives",
+    "evenly_spread",
+    "rank_pairs",
+]
+"""What plugins may use, as `cfx.plugin.pair_lines`."""
+
 
 TIME_TITLE = "time from the start of the pair (s)"
 
@@ -66,7 +58,7 @@ class Panel:
     """
 
     title: str
-    lines: tuple[Line, ...]
+    lines: tuple[canvas.Line, ...]
     low: float | None
     high: float | None
     notes: tuple[tuple[str, bool], ...] = ()
@@ -103,14 +95,14 @@ def pair_panels(
     """
     time = trajectory.time
     present = [method for method in methods if method in trajectory.speed]
-    speed_lines = [Line("leader", time, trajectory.leader_speed)]
+    speed_lines = [canvas.Line("leader", time, trajectory.leader_speed)]
     speed_lines += _lines(time, trajectory.real_speed, trajectory.speed, present)
     gap_lines = _lines(time, trajectory.real_gap, trajectory.gap, present)
     panels = []
     for k, parameter in enumerate(parameters):
         lines = []
         for method in present:
-            lines.append(Line(method, time, trajectory.parameters[method][:, k], steps=True))
+            lines.append(canvas.Line(method, time, trajectory.parameters[method][:, k], steps=True))
         panels.append(_parameter_panel(parameter, tuple(lines)))
     return PairPanels(
         trajectory.pair_id,
@@ -121,18 +113,21 @@ def pair_panels(
 
 
 def _lines(
-    time: Array, real: Array, simulated: Mapping[str, Array], methods: Sequence[str]
-) -> list[Line]:
-    lines = [Line("real", time, real)]
+    time: canvas.Array,
+    real: canvas.Array,
+    simulated: Mapping[str, canvas.Array],
+    methods: Sequence[str],
+) -> list[canvas.Line]:
+    lines = [canvas.Line("real", time, real)]
     for method in methods:
-        lines.append(Line(method, time, simulated[method]))
+        lines.append(canvas.Line(method, time, simulated[method]))
     return lines
 
 
 def _signal_panel(
     name: str,
     unit: str,
-    lines: tuple[Line, ...],
+    lines: tuple[canvas.Line, ...],
     collisions: tuple[tuple[str, float, float], ...] = (),
 ) -> Panel:
     """Chooses the axis by the lines that matter; a note says how far a default lies off them."""
@@ -140,31 +135,31 @@ def _signal_panel(
     notes: list[tuple[str, bool]] = []
     if low is not None and high is not None:
         defaults = [line.values for line in lines if line.method == "default"]
-        far = finite(np.concatenate([np.empty(0), *defaults]))
+        far = canvas.finite(np.concatenate([np.empty(0), *defaults]))
         height = max(high - low, 1.0)
         lowest, highest = low - _ROOM * height, high + _ROOM * height
         if len(far):
             least, most = float(far.min()), float(far.max())
             if most > highest:
-                notes.append((f"default up to {number_text(most)} {unit} ↑", True))
+                notes.append((f"default up to {wording.number_text(most)} {unit} ↑", True))
             if least < lowest:
-                notes.append((f"default down to {number_text(least)} {unit} ↓", False))
+                notes.append((f"default down to {wording.number_text(least)} {unit} ↓", False))
             low, high = min(low, max(least, lowest)), max(high, min(most, highest))
         low, high = low - 0.06 * height, high + 0.06 * height
-    title = unit_label(name, unit)
+    title = wording.unit_label(name, unit)
     return Panel(title, lines, low, high, tuple(notes), collisions)
 
 
-def _range(lines: Sequence[Line]) -> tuple[float | None, float | None]:
+def _range(lines: Sequence[canvas.Line]) -> tuple[float | None, float | None]:
     """Returns the lowest and the highest value of the lines that are not hidden; None for none."""
     seen = [line.values for line in lines if not line.hidden]
-    values = finite(np.concatenate([np.empty(0), *seen]))
+    values = canvas.finite(np.concatenate([np.empty(0), *seen]))
     if not len(values):
         return None, None
     return float(values.min()), float(values.max())
 
 
-def _collisions(lines: Sequence[Line]) -> tuple[tuple[str, float, float], ...]:
+def _collisions(lines: Sequence[canvas.Line]) -> tuple[tuple[str, float, float], ...]:
     found = []
     for line in lines:
         hit = np.flatnonzero(line.values < 0)
@@ -174,9 +169,9 @@ def _collisions(lines: Sequence[Line]) -> tuple[tuple[str, float, float], ...]:
     return tuple(found)
 
 
-def _parameter_panel(parameter: ParameterAxis, lines: tuple[Line, ...]) -> Panel:
+def _parameter_panel(parameter: ParameterAxis, lines: tuple[canvas.Line, ...]) -> Panel:
     """Chooses an axis of at least a fifth of the range: a small change looks small."""
-    title, said = unit_label(parameter.name, parameter.unit), parameter.meaning
+    title, said = wording.unit_label(parameter.name, parameter.unit), parameter.meaning
     lowest, highest = _range(lines)
     if parameter.low is None or parameter.high is None:
         if lowest is None or highest is None:
@@ -197,7 +192,7 @@ _LINE = 150
 """Characters of a small title that fit into the width of a figure."""
 
 
-@styled
+@canvas.styled
 def draw_pairs(
     titles: Sequence[tuple[str, str, str]],
     pairs: Sequence[PairPanels],
@@ -212,7 +207,7 @@ def draw_pairs(
         methods: for the legend.
         explained: what percentages in the titles mean; stands above the legend.
     """
-    figure = canvas(0.75 + 2.35 * len(pairs))
+    figure = canvas.blank(0.75 + 2.35 * len(pairs))
     grid = _rows_of_two(figure, len(pairs))
     for (speed_axes, gap_axes), pair, title in zip(grid, pairs, titles, strict=True):
         draw_panel(speed_axes, pair.speed)
@@ -227,14 +222,14 @@ def draw_pairs(
 
 def _rows_of_two(figure: Figure, rows: int) -> list[list[Axes]]:
     """Returns two panels a row; on narrow paper each below the other."""
-    if most_across(2) == 2:
+    if canvas.most_across(2) == 2:
         grid = figure.subplots(rows, 2, squeeze=False, sharex="row", width_ratios=(1.12, 1.0))
         return [list(row) for row in grid]
     figure.set_figheight(2 * figure.get_figheight())
     return [list(row) for row in figure.subplots(2 * rows, 1).reshape(rows, 2)]
 
 
-@styled
+@canvas.styled
 def draw_speeds(
     trajectory: PairTrajectory, methods: Sequence[str], errors: Mapping[str, float]
 ) -> Figure:
@@ -245,21 +240,21 @@ def draw_speeds(
         methods: those to show.
         errors: by method, RMSE of speed, m/s.
     """
-    figure = canvas(0.8 + 1.9 * len(methods))
+    figure = canvas.blank(0.8 + 1.9 * len(methods))
     grid = figure.subplots(len(methods), 1, sharex=True, squeeze=False)[:, 0]
     for axes, method in zip(grid, methods, strict=True):
         simulated = {method: trajectory.speed[method]}
-        draw_lines(axes, _lines(trajectory.time, trajectory.real_speed, simulated, [method]))
-        title = f"{method_label(method)}: RMSE of speed {errors[method]:.3f} m/s"
-        axes.set_title(title, fontsize=points(9.5), color=INK)
+        canvas.draw_lines(axes, _lines(trajectory.time, trajectory.real_speed, simulated, [method]))
+        title = f"{wording.method_label(method)}: RMSE of speed {errors[method]:.3f} m/s"
+        axes.set_title(title, fontsize=canvas.points(9.5), color=colours.INK)
         axes.set_ylabel("speed (m/s)")
     grid[-1].set_xlabel(TIME_TITLE)
-    title = f"pair {shortened(trajectory.pair_id, 60)}, test part"
-    method_legend(figure, ["real", *methods], title)
+    title = f"pair {wording.shortened(trajectory.pair_id, 60)}, test part"
+    canvas.method_legend(figure, ["real", *methods], title)
     return figure
 
 
-@styled
+@canvas.styled
 def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     """Draws the parameters that each method used over time, a small panel per parameter.
 
@@ -267,15 +262,15 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     outside a parameter's bounds is shaded, and its bounds and its meaning stand in the title.
     """
     count = len(pair.parameters)
-    columns = min(_columns(count), most_across(4))
+    columns = min(_columns(count), canvas.most_across(4))
     rows = -(-(count + 1) // columns)
-    figure = canvas(1.0 + (1.75 if columns == 1 else 2.0) * rows)
+    figure = canvas.blank(1.0 + (1.75 if columns == 1 else 2.0) * rows)
     grid = figure.add_gridspec(rows, columns)
     # The speeds take the cells that the parameters leave over, so that the grid has no hole.
     span = rows * columns - count
     speeds = figure.add_subplot(grid[0, :span])
     shown = [line for line in pair.speed.lines if line.method in {"leader", "real", "policy"}]
-    draw_lines(speeds, shown)
+    canvas.draw_lines(speeds, shown)
     speeds.set_title(pair.speed.title)
     panels = [speeds]
     panels += _draw_parameters(speeds, grid, pair.parameters, first=span)
@@ -283,11 +278,11 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     speeds.xaxis.set_major_locator(MaxNLocator(12 // columns, integer=True))
     for axes in panels:
         axes.tick_params(labelbottom=axes in panels[-columns:])
-    _finish(figure, methods, f"pair {shortened(pair.pair_id, 60)}")
+    _finish(figure, methods, f"pair {wording.shortened(pair.pair_id, 60)}")
     return figure
 
 
-@styled
+@canvas.styled
 def draw_pair(result: Result, pair_id: str) -> Figure:
     """Draws speed, gap and each tuned parameter of one pair over the test part.
 
@@ -296,9 +291,9 @@ def draw_pair(result: Result, pair_id: str) -> Figure:
     """
     ((_, trajectory),) = chosen_pairs(result, pair_id, 1)
     pair = pair_panels(trajectory, result.shown_methods, result.parameters)
-    columns = max(2, most_across(2 if len(pair.parameters) <= 4 else 4))
+    columns = max(2, canvas.most_across(2 if len(pair.parameters) <= 4 else 4))
     rows = -(-len(pair.parameters) // columns)
-    figure = canvas(3.4 + 1.75 * rows)
+    figure = canvas.blank(3.4 + 1.75 * rows)
     grid = figure.add_gridspec(rows + 1, columns, height_ratios=(1.6, *[1.0] * rows))
     speeds = figure.add_subplot(grid[0, : columns // 2])
     gaps = figure.add_subplot(grid[0, columns // 2 :], sharex=speeds)
@@ -326,18 +321,18 @@ def _draw_parameters(
 
 def _finish(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
     """Says below all panels what time they share, and above them who drives."""
-    figure.supxlabel(TIME_TITLE, fontsize=points(10.5), color=INK)
+    figure.supxlabel(TIME_TITLE, fontsize=canvas.points(10.5), color=colours.INK)
     _legend(figure, methods, title)
 
 
 def _legend(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
-    visible = [method for method in methods if method not in HIDDEN]
-    method_legend(figure, ["real", "leader", *visible], title)
+    visible = [method for method in methods if method not in canvas.HIDDEN]
+    canvas.method_legend(figure, ["real", "leader", *visible], title)
 
 
 def draw_panel(axes: Axes, panel: Panel) -> None:
     """Draws lines, notes, collisions and bounds of one panel."""
-    draw_lines(axes, panel.lines)
+    canvas.draw_lines(axes, panel.lines)
     if panel.low is not None and panel.high is not None:
         axes.set_ylim(panel.low, panel.high)
         if panel.bounds is not None:
@@ -346,18 +341,18 @@ def draw_panel(axes: Axes, panel: Panel) -> None:
     for text, above in panel.notes:
         _write_note(axes, text, above=above)
     for method, time, gap in panel.collisions:
-        colour, place = colour_of(method), (time, gap)
+        colour, place = colours.colour_of(method), (time, gap)
         axes.plot(*place, marker="X", markersize=9, color=colour, mec="white", zorder=6)
         axes.annotate(
-            f"{short_label(method)} collides",
+            f"{wording.short_label(method)} collides",
             place,
             (6, 6),
             textcoords="offset points",
             color=colour,
-            fontsize=points(9),
+            fontsize=canvas.points(9),
             annotation_clip=True,
         )
-        axes.axhline(0, color=INK, linewidth=0.8)
+        axes.axhline(0, color=colours.INK, linewidth=0.8)
 
 
 def _columns(parameters: int) -> int:
@@ -369,10 +364,10 @@ def _columns(parameters: int) -> int:
 
 def _shade_outside(axes: Axes, bounds: tuple[float, float], low: float, high: float) -> None:
     width = high - low
-    axes.axhspan(min(low, bounds[0]) - width, bounds[0], color=BAND, zorder=0)
-    axes.axhspan(bounds[1], max(high, bounds[1]) + width, color=BAND, zorder=0)
+    axes.axhspan(min(low, bounds[0]) - width, bounds[0], color=colours.BAND, zorder=0)
+    axes.axhspan(bounds[1], max(high, bounds[1]) + width, color=colours.BAND, zorder=0)
     for bound in bounds:
-        axes.axhline(bound, color=EDGE, linewidth=0.9, zorder=1)
+        axes.axhline(bound, color=colours.EDGE, linewidth=0.9, zorder=1)
     axes.set_ylim(low, high)
 
 
@@ -380,17 +375,19 @@ def _titles_of_parameter(axes: Axes, panel: Panel, length: int) -> None:
     """Writes name, unit and bounds, and below them what the parameter means."""
     title = panel.title
     if panel.bounds is not None:
-        title += f", {number_text(panel.bounds[0])} to {number_text(panel.bounds[1])}"
+        title += (
+            f", {wording.number_text(panel.bounds[0])} to {wording.number_text(panel.bounds[1])}"
+        )
     lines = textwrap.wrap(panel.meaning, length, max_lines=2, placeholder=" …")
-    axes.set_title("\n".join(lines), fontsize=points(8), color=INK)
-    _above(axes, title, points(6 + 11 * len(lines)), fontsize=points(10.5))
+    axes.set_title("\n".join(lines), fontsize=canvas.points(8), color=colours.INK)
+    _above(axes, title, canvas.points(6 + 11 * len(lines)), fontsize=canvas.points(10.5))
 
 
 def _two_line_title(axes: Axes, strong: str, fine: str) -> None:
     # Several methods' errors stand beside each other.
-    axes.set_title(fine, fontsize=points(7.6), color=INK)
+    axes.set_title(fine, fontsize=canvas.points(7.6), color=colours.INK)
     if strong:
-        _above(axes, strong, points(20), fontsize=points(11), fontweight="bold")
+        _above(axes, strong, canvas.points(20), fontsize=canvas.points(11), fontweight="bold")
 
 
 def _above(axes: Axes, text: str, points: float, **font: Any) -> None:
@@ -415,8 +412,8 @@ def _write_note(axes: Axes, text: str, *, above: bool) -> None:
         transform=axes.transAxes,
         ha="right",
         va=aligned,
-        color=colour_of("default"),
-        fontsize=points(9),
+        color=colours.colour_of("default"),
+        fontsize=canvas.points(9),
         bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 1.5},
         zorder=5,
     )
@@ -437,9 +434,9 @@ def drives(result: Result, pair_id: str | Sequence[str] | None = None, count: in
     titles, panels = [], []
     explained: str | None = None
     for ranked, trajectory in chosen_pairs(result, pair_id, count):
-        name = RankedPair(shortened(ranked.pair_id), ranked.rank, ranked.improvement).title
+        name = RankedPair(wording.shortened(ranked.pair_id), ranked.rank, ranked.improvement).title
         if np.isfinite(ranked.improvement):
-            name += f":  {percent(ranked.improvement)}"
+            name += f":  {wording.percent(ranked.improvement)}"
             explained = f"percentages: {improvement_title('fixed')}"
         elif {"fixed", "policy"} <= set(result.shown_methods):
             name += ":  improvement undefined"
@@ -510,7 +507,7 @@ def chosen_pairs(
     is_calibration = "policy" not in result.shown_methods
     judged = "policy"
     if is_calibration:  # the drivers' own constant set, which stands last, if there is one
-        judged = [method for method in result.shown_methods if method not in HIDDEN][-1]
+        judged = [method for method in result.shown_methods if method not in canvas.HIDDEN][-1]
     rows = result.pairs[result.pairs["method"] == judged]
     rows = rows[rows["pair_id"].isin(list(by_id))]
     gains = pd.Series(np.nan, index=rows["pair_id"].astype(str))
@@ -546,9 +543,9 @@ def _errors_text(result: Result, pair_id: str, signal: str, unit: str) -> str:
     """Returns a title such as "RMSE of speed (m/s): default 1.02, policy 0.31"."""
     listed = []
     for method, error in _errors(result, pair_id, signal).items():
-        if method not in HIDDEN:
+        if method not in canvas.HIDDEN:
             value = f"{error:.2f}" if np.isfinite(error) else "none"
-            listed.append(f"{short_label(method)} {value}")
+            listed.append(f"{wording.short_label(method)} {value}")
     return f"RMSE of {signal} ({unit}): {', '.join(listed)}"
 
 

@@ -1,40 +1,34 @@
-"""Improvements of the policy: pair by pair, and by the history that it has read."""
+"""Improvements of the policy, pair by pair."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from cfx.plugin import (
-    COLOURS,
-    INK,
-    Array,
-    Dash,
-    Improvement,
-    JobFigure,
-    Result,
-    canvas,
-    common_prefix,
-    finite,
-    hover,
-    legend_above,
-    method_label,
-    percent,
-    percent_axis,
-    percent_or_undefined,
-    plural,
-    points,
-    shortened,
-    styled,
-    write_note,
-)
+from cfx.figures import canvas, colours, wording
+from cfx.results.figure import JobFigure
+
+if TYPE_CHECKING:
+    from cfx.evaluation.statistics import Improvement
+    from cfx.results.result import Result
+
+__all__ = [
+    "ImprovementAxis",
+    "ImprovementBars",
+    "improvement_axis",
+    "improvement_bars",
+    "improvement_title",
+    "vertical_improvements",
+]
+"""What plugins may use, as `cfx.plugin.improvement_bars`."""
+
 
 WORST_WITHOUT_CUT = -0.6
 """Improvements above this are never cut off, however far they lie from the others."""
@@ -73,8 +67,8 @@ class ImprovementSeries:
 
     name: str
     pair_ids: tuple[str, ...]
-    values: Array
-    shown: Array
+    values: canvas.Array
+    shown: canvas.Array
     clipped: np.ndarray
 
 
@@ -95,11 +89,11 @@ class ImprovementBars:
 
 def improvement_title(baseline: str) -> str:
     """Returns what an axis of improvements over a baseline is called."""
-    return f"improvement of the RMSE of speed over {method_label(baseline)}"
+    return f"improvement of the RMSE of speed over {wording.method_label(baseline)}"
 
 
 def improvement_axis(
-    values: Array, marks: Sequence[float] = (), *, baseline: str, what: str = "improvements"
+    values: canvas.Array, marks: Sequence[float] = (), *, baseline: str, what: str = "improvements"
 ) -> ImprovementAxis:
     """Chooses an axis that a few very bad improvements do not shrink.
 
@@ -113,7 +107,7 @@ def improvement_axis(
         baseline: the method that the policy is compared with.
         what: what is cut off, in the note.
     """
-    title, known = improvement_title(baseline), finite(values)
+    title, known = improvement_title(baseline), canvas.finite(values)
     undefined = len(np.asarray(values).ravel()) - len(known)
     if not len(known):
         note = f"No pair has a defined improvement ({undefined} are undefined)."
@@ -122,9 +116,9 @@ def improvement_axis(
     fence = min(float(q1 - _FAR_OUT * (q3 - q1)), WORST_WITHOUT_CUT)
     lowest = float(known.min())
     # The mean and its interval stay in view as long as they do not dwarf the bars themselves.
-    near = [mark for mark in finite(marks) if mark > _FAR_OUT * fence]
+    near = [mark for mark in canvas.finite(marks) if mark > _FAR_OUT * fence]
     low = min([max(lowest, fence), 0.0, *near])
-    high = max([float(known.max()), 0.0, *finite(marks)])
+    high = max([float(known.max()), 0.0, *canvas.finite(marks)])
     margin = _MARGIN * max(high - low, 0.1)
     if lowest >= fence:
         low -= margin
@@ -132,11 +126,11 @@ def improvement_axis(
     parts = []
     if count:
         parts.append(
-            f"The axis is cut at {percent(low)}: {count} of {len(known)} {what} are lower,"
-            f" the lowest is {percent(lowest)}."
+            f"The axis is cut at {wording.percent(low)}: {count} of {len(known)} {what} are lower,"
+            f" the lowest is {wording.percent(lowest)}."
         )
     if undefined:
-        parts.append(f"{plural(undefined, 'improvement')} not defined and not shown.")
+        parts.append(f"{wording.plural(undefined, 'improvement')} not defined and not shown.")
     return ImprovementAxis(low, high + margin, title, " ".join(parts))
 
 
@@ -144,13 +138,13 @@ def vertical_improvements(axes: Axes, axis: ImprovementAxis) -> None:
     """Make the vertical axis one of improvements."""
     axes.set_ylim(axis.low, axis.high)
     axes.set_ylabel(axis.title.replace(" over ", "\nover ") + " (%)")
-    percent_axis(axes)
+    canvas.percent_axis(axes)
 
 
 def improvement_bars(
     names: Sequence[str],
     pair_ids: Sequence[Sequence[str]],
-    improvements: Sequence[Array],
+    improvements: Sequence[canvas.Array],
     *,
     baseline: str = "fixed",
     marks: Sequence[float] = (),
@@ -172,7 +166,9 @@ def improvement_bars(
     return ImprovementBars(tuple(series), axis, int((~np.isfinite(every)).sum()))
 
 
-def _series(name: str, pair_ids: Sequence[str], values: Array, low: float) -> ImprovementSeries:
+def _series(
+    name: str, pair_ids: Sequence[str], values: canvas.Array, low: float
+) -> ImprovementSeries:
     defined = np.flatnonzero(np.isfinite(values))
     order = defined[np.argsort(-values[defined], kind="stable")]
     kept = values[order]
@@ -187,7 +183,7 @@ _LABELLED = 8
 """Up to so many bars that are cut off carry their value; of more, only the worst."""
 
 
-@styled
+@canvas.styled
 def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
     """Draws sorted bars of every pair's improvement with its summaries and the 95 % interval.
 
@@ -200,12 +196,12 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
     """
     (series,) = bars.series
     named = len(series.pair_ids) <= _NAMED
-    prefix = common_prefix(list(series.pair_ids))
+    prefix = wording.common_prefix(list(series.pair_ids))
     ticks = []
     for name in series.pair_ids:
-        ticks.append(shortened(name.removeprefix(prefix), 16))
+        ticks.append(wording.shortened(name.removeprefix(prefix), 16))
     longest = max(map(len, ticks), default=0) if named else 0
-    figure = canvas(4.3 + 0.075 * longest)
+    figure = canvas.blank(4.3 + 0.075 * longest)
     axes = figure.subplots()
     vertical_improvements(axes, bars.axis)
     _bars(axes, series, bars.axis.low)
@@ -216,31 +212,33 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
     axes.set_xlim(middle - half, middle + half)
     axes.grid(visible=False, axis="x")
     if named:
-        axes.set_xticks(np.arange(count), ticks, rotation=90, fontsize=points(8.5))
+        axes.set_xticks(np.arange(count), ticks, rotation=90, fontsize=canvas.points(8.5))
         axes.tick_params(axis="x", length=0)
     else:
         axes.set_xticks([])
     axes.set_xlabel(_pairs_title(bars, prefix if named else ""))
     if not count:
-        write_note(axes, "no pair has a defined improvement")
-    legend_above(figure, handles, columnspacing=1.8, handlelength=1.8)
+        canvas.write_note(axes, "no pair has a defined improvement")
+    canvas.legend_above(figure, handles, columnspacing=1.8, handlelength=1.8)
     return figure
 
 
 def _bars(axes: Axes, series: ImprovementSeries, low: float) -> None:
     places = np.arange(len(series.values))
-    colours = np.where(series.values > 0, COLOURS["policy"], COLOURS["fixed"]).tolist()
-    drawn = axes.bar(places, series.shown, width=0.82, color=colours)
+    bar_colours = np.where(
+        series.values > 0, colours.COLOURS["policy"], colours.COLOURS["fixed"]
+    ).tolist()
+    drawn = axes.bar(places, series.shown, width=0.82, color=bar_colours)
     for bar, pair, value in zip(drawn, series.pair_ids, series.values, strict=True):
-        hover(bar, f"pair {pair}: {percent(float(value), 1)}")
-    axes.axhline(0, color=INK, linewidth=0.9)
+        canvas.hover(bar, f"pair {pair}: {wording.percent(float(value), 1)}")
+    axes.axhline(0, color=colours.INK, linewidth=0.9)
     cut = np.flatnonzero(series.clipped)
     arrow = low + 0.035 * (axes.get_ylim()[1] - low)
     for index in cut:
         axes.plot(places[index], arrow, marker="v", color="white", markersize=5, zorder=4)
         if len(cut) <= _LABELLED or index == cut[-1]:
             axes.annotate(
-                percent(float(series.values[index])),
+                wording.percent(float(series.values[index])),
                 (float(places[index]), low),
                 (0, 14),
                 textcoords="offset points",
@@ -248,7 +246,7 @@ def _bars(axes: Axes, series: ImprovementSeries, low: float) -> None:
                 va="bottom",
                 rotation=90,
                 color="white",
-                fontsize=points(9),
+                fontsize=canvas.points(9),
                 fontweight="bold",
                 zorder=5,
             )
@@ -258,8 +256,11 @@ def _closer(series: ImprovementSeries) -> list[Line2D | Patch]:
     policy = int((series.values > 0).sum())
     others = len(series.values) - policy
     return [
-        Patch(color=COLOURS["policy"], label=f"policy closer to the driver: {policy}"),
-        Patch(color=COLOURS["fixed"], label=f"{method_label('fixed')} closer, or equal: {others}"),
+        Patch(color=colours.COLOURS["policy"], label=f"policy closer to the driver: {policy}"),
+        Patch(
+            color=colours.COLOURS["fixed"],
+            label=f"{wording.method_label('fixed')} closer, or equal: {others}",
+        ),
     ]
 
 
@@ -269,15 +270,15 @@ def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | P
     ends = (summary.ci95_low, summary.ci95_high)
     if np.isfinite(ends).all():
         axes.axhspan(*ends, color="#000000", alpha=0.13, linewidth=0, zorder=0.5)
-        text = f"its 95 % interval: {percent(ends[0], 1)} to {percent(ends[1], 1)}"
+        text = f"its 95 % interval: {wording.percent(ends[0], 1)} to {wording.percent(ends[1], 1)}"
         handles.append(Patch(color="#000000", alpha=0.13, label=text))
-    lines: tuple[tuple[str, float, Dash, float], ...] = (
+    lines: tuple[tuple[str, float, canvas.Dash, float], ...] = (
         ("improvement (geometric mean over drivers)", summary.geometric, "solid", 1.8),
         ("of the mean errors", summary.ratio_of_means, (0, (5, 1.8)), 1.4),
         ("median", summary.median, (0, (1.2, 1.4)), 1.6),
     )
     for name, value, dash, width in lines:
-        text = f"{name} {percent_or_undefined(value, 1)}"
+        text = f"{name} {wording.percent_or_undefined(value, 1)}"
         if np.isfinite(value):
             axes.axhline(value, color="black", linestyle=dash, linewidth=width, zorder=3)
         if value < low:
@@ -287,9 +288,9 @@ def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | P
 
 
 def _pairs_title(bars: ImprovementBars, prefix: str) -> str:
-    title = plural(len(bars.series[0].values), "pair")
+    title = wording.plural(len(bars.series[0].values), "pair")
     if prefix:
-        title += f" of {shortened(prefix.rstrip('_-/:.'), 30)}"
+        title += f" of {wording.shortened(prefix.rstrip('_-/:.'), 30)}"
     title += ", best to worst"
     if bars.undefined:
         title += f"; {bars.undefined} without a defined improvement"
@@ -325,105 +326,3 @@ def draw_improvement(result: Result, baseline: str, column: str) -> Figure:
         marks=(summary.geometric, summary.ci95_low, summary.ci95_high),
     )
     return draw_improvements(bars, summary)
-
-
-BASES = {"own": "fixed", "population": "population"}
-"""The method whose colour a base has: the parameters that the policy's answers are offsets from."""
-
-BASE_LABELS = {
-    "own": "offsets from driver-specific calibration",
-    "population": "offsets from pooled calibration",
-}
-
-
-def history_curves(history: pd.DataFrame) -> pd.DataFrame:
-    """Return the improvement over driver-specific calibration by base and amount of burn-in.
-
-    Args:
-        history: as `Evaluation.history`.
-
-    Returns:
-        A row per base and amount, each in its order: `base`, `amount`, `mean`, `low` and `high`
-        (fractions; mean over pairs and its 95 % interval), `pairs` with a defined improvement.
-    """
-    from cfx.plugin import mean_interval  # imports scipy
-
-    rows = []
-    for base in sorted(history["base"].unique(), key=_place_of_base):
-        for amount in amounts_of(history):
-            chosen = history[(history["base"] == base) & (history["amount"] == amount)]
-            if len(chosen):
-                gains = chosen["improvement"].astype(float).tolist()
-                interval = mean_interval(gains, chosen["driver"].astype(str).tolist())
-                rows.append((str(base), amount, *interval, int(np.isfinite(gains).sum())))
-    return pd.DataFrame(rows, columns=["base", "amount", "mean", "low", "high", "pairs"])
-
-
-def amounts_of(history: pd.DataFrame) -> list[str]:
-    """Returns the amounts of history in words, the smallest first; a share comes after seconds."""
-    longest = history.groupby("amount")["history_s"].max()
-    return sorted(
-        (str(amount) for amount in longest.index),
-        key=lambda amount: (amount.endswith("%"), longest[amount]),
-    )
-
-
-def _place_of_base(base: str) -> tuple[int, str]:
-    known = list(BASES)
-    return (known.index(base) if base in known else len(known), base)
-
-
-@styled
-def draw_history(history: pd.DataFrame) -> Figure:
-    """Draw the mean improvement and its 95 % interval against the amount of burn-in.
-
-    Args:
-        history: as `Evaluation.history`.
-    """
-    figure = canvas(3.9)
-    axes = figure.subplots()
-    amounts, curves = amounts_of(history), history_curves(history)
-    bases = curves["base"].unique()
-    for k, base in enumerate(bases):
-        curve = curves[curves["base"] == base]
-        aside = 0.06 * (k - 0.5 * (len(bases) - 1))
-        places = np.array([amounts.index(amount) for amount in curve["amount"]]) + aside
-        mean, low, high = (curve[name].to_numpy(dtype=float) for name in ("mean", "low", "high"))
-        axes.errorbar(
-            places,
-            mean,
-            np.nan_to_num(np.stack([mean - low, high - mean])),
-            color=COLOURS.get(BASES.get(base, ""), INK),
-            marker="o",
-            linewidth=1.8,
-            capsize=4,
-            label=BASE_LABELS.get(base, base),
-        )
-    axes.axhline(0, color=INK, linewidth=0.9)
-    axes.set_xticks(range(len(amounts)), amounts)
-    axes.set_xlim(-0.4, len(amounts) - 0.6)
-    axes.set_xlabel("burn-in: measured history before the test part")
-    axes.set_ylabel(improvement_title("fixed").replace(" over ", "\nover ") + " (%)")
-    percent_axis(axes)
-    title = "mean over pairs and its 95 % interval"
-    legend_above(figure, columns=2, title=title)
-    return figure
-
-
-class History(JobFigure):
-    """What a policy gains from the measured history before the test part."""
-
-    title = "Improvement by the amount of burn-in"
-    caption = (
-        "Before the test part, the policy is fed with measured history of the driver, its burn-in."
-        " Here the same test part after less and after more of it: mean improvement over"
-        " driver-specific calibration, with its 95 % interval."
-    )
-    order = 100
-
-    def draw(self, result: Result) -> Figure | None:
-        """Draws it where the history was varied."""
-        table = result.tables.get("history")
-        if table is None:
-            return None
-        return draw_history(table)

@@ -1,0 +1,112 @@
+"""Improvements of the policy by the history that it has read."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+from matplotlib.figure import Figure
+
+from cfx.plugin import JobFigure, Result, canvas, colours, improvement_bars
+
+BASES = {"own": "fixed", "population": "population"}
+"""The method whose colour a base has: the parameters that the policy's answers are offsets from."""
+
+BASE_LABELS = {
+    "own": "offsets from driver-specific calibration",
+    "population": "offsets from pooled calibration",
+}
+
+
+def history_curves(history: pd.DataFrame) -> pd.DataFrame:
+    """Return the improvement over driver-specific calibration by base and amount of burn-in.
+
+    Args:
+        history: as `Evaluation.history`.
+
+    Returns:
+        A row per base and amount, each in its order: `base`, `amount`, `mean`, `low` and `high`
+        (fractions; mean over pairs and its 95 % interval), `pairs` with a defined improvement.
+    """
+    from cfx.plugin import statistics  # imports scipy
+
+    rows = []
+    for base in sorted(history["base"].unique(), key=_place_of_base):
+        for amount in amounts_of(history):
+            chosen = history[(history["base"] == base) & (history["amount"] == amount)]
+            if len(chosen):
+                gains = chosen["improvement"].astype(float).tolist()
+                interval = statistics.mean_interval(gains, chosen["driver"].astype(str).tolist())
+                rows.append((str(base), amount, *interval, int(np.isfinite(gains).sum())))
+    return pd.DataFrame(rows, columns=["base", "amount", "mean", "low", "high", "pairs"])
+
+
+def amounts_of(history: pd.DataFrame) -> list[str]:
+    """Returns the amounts of history in words, the smallest first; a share comes after seconds."""
+    longest = history.groupby("amount")["history_s"].max()
+    return sorted(
+        (str(amount) for amount in longest.index),
+        key=lambda amount: (amount.endswith("%"), longest[amount]),
+    )
+
+
+def _place_of_base(base: str) -> tuple[int, str]:
+    known = list(BASES)
+    return (known.index(base) if base in known else len(known), base)
+
+
+@canvas.styled
+def draw_history(history: pd.DataFrame) -> Figure:
+    """Draw the mean improvement and its 95 % interval against the amount of burn-in.
+
+    Args:
+        history: as `Evaluation.history`.
+    """
+    figure = canvas.blank(3.9)
+    axes = figure.subplots()
+    amounts, curves = amounts_of(history), history_curves(history)
+    bases = curves["base"].unique()
+    for k, base in enumerate(bases):
+        curve = curves[curves["base"] == base]
+        aside = 0.06 * (k - 0.5 * (len(bases) - 1))
+        places = np.array([amounts.index(amount) for amount in curve["amount"]]) + aside
+        mean, low, high = (curve[name].to_numpy(dtype=float) for name in ("mean", "low", "high"))
+        axes.errorbar(
+            places,
+            mean,
+            np.nan_to_num(np.stack([mean - low, high - mean])),
+            color=colours.COLOURS.get(BASES.get(base, ""), colours.INK),
+            marker="o",
+            linewidth=1.8,
+            capsize=4,
+            label=BASE_LABELS.get(base, base),
+        )
+    axes.axhline(0, color=colours.INK, linewidth=0.9)
+    axes.set_xticks(range(len(amounts)), amounts)
+    axes.set_xlim(-0.4, len(amounts) - 0.6)
+    axes.set_xlabel("burn-in: measured history before the test part")
+    axes.set_ylabel(
+        improvement_bars.improvement_title("fixed").replace(" over ", "\nover ") + " (%)"
+    )
+    canvas.percent_axis(axes)
+    title = "mean over pairs and its 95 % interval"
+    canvas.legend_above(figure, columns=2, title=title)
+    return figure
+
+
+class History(JobFigure):
+    """What a policy gains from the measured history before the test part."""
+
+    title = "Improvement by the amount of burn-in"
+    caption = (
+        "Before the test part, the policy is fed with measured history of the driver, its burn-in."
+        " Here the same test part after less and after more of it: mean improvement over"
+        " driver-specific calibration, with its 95 % interval."
+    )
+    order = 100
+
+    def draw(self, result: Result) -> Figure | None:
+        """Draws it where the history was varied."""
+        table = result.tables.get("history")
+        if table is None:
+            return None
+        return draw_history(table)
