@@ -6,7 +6,7 @@ An improvement is geometric, `1 - exp(mean of log(error / baseline))`. A mean of
 paper prints, is below zero where two methods are equally good, since a ratio above 1
 weighs more than one below: -3 % where the logarithms differ by a noise of 0.25. Averages of
 logarithms have no such bias, and the t interval of their mean holds its level for few drivers too
-(`tests/evaluation/estimator_level.py` measures both).
+(`tests/evaluation/test_level.py` measures both).
 """
 
 from __future__ import annotations

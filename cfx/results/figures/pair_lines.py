@@ -423,7 +423,7 @@ def drives(result: Result, pair_id: str | Sequence[str] | None = None, count: in
     """Speed and gap over the test part, a row per pair.
 
     Args:
-        results: of a job.
+        result: of a job.
         pair_id: the pairs to show; None for `count` pairs from the best to the worst improvement,
             without a policy from the smallest to the largest error.
         count: how many.
@@ -496,7 +496,7 @@ def chosen_pairs(
     """Returns the pairs that a figure shows, with their test parts.
 
     Args:
-        results: of a job.
+        result: of a job.
         pair_id: their ids; None for `count` pairs, as `drives` takes them.
         count: how many.
 
