@@ -119,7 +119,7 @@ def test_the_terminal_says_what_matters(finished: cfx.plugin.Result) -> None:
         "default",
         "driver-specific",
         "policy",
-        "RMSE speed",
+        "RMSE",
         "policy better by %",
         "In short: ",
         "Results:",

@@ -642,5 +642,6 @@ def _write_figures(folder: Path, result: Result, config: JobConfig) -> list[Path
         if figure.name not in drawn_names:
             others.append(figure.name)
     if others and config.figures != "none":
-        log.info("Not drawn (figures=all, or figures=[own,NAME]): %s", ", ".join(others))
+        words = "Not drawn (figures=all, or figures=[own,NAME]): %s"
+        log.info(words, ", ".join(others), extra={"file_only": True})
     return paths

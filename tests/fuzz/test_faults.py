@@ -43,7 +43,7 @@ MODULES = (
 """Whoever writes files."""
 
 WHOLE = cfx.core.files.atomic_write
-STRIDE = int(os.environ.get("CFX_FAULTS_STRIDE", "161"))
+STRIDE = int(os.environ.get("CFX_FAULTS_STRIDE", "97"))
 """Of the faults every so manieth is tried, of another kind at another moment; `make fuzz` tries all."""
 
 KINDS = ("ENOSPC", "EIO", "EACCES", "killed")

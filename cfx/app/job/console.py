@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 def report(result: Result, console: Console, *, verbose: bool = False) -> None:
     """Prints what was measured: one table and one sentence; if `verbose`, all that is known."""
     evaluation, metrics = result.evaluation, result.metrics
-    console.print(methods_table(result, with_improvement=True))
+    _print_methods(result, console, "test", with_improvement=True)
     if verbose and "full_trajectory" in evaluation.improvements:
-        console.print(methods_table(result, "full_trajectory"))
+        _print_methods(result, console, "full_trajectory")
     compared = _comparisons(evaluation)
     adapts = evaluation.purpose is Purpose.ADAPTATION and bool(compared)
     if verbose and adapts:
@@ -51,6 +51,14 @@ def report(result: Result, console: Console, *, verbose: bool = False) -> None:
                 console.print(printed)
     if verbose:
         _say(_remarks(result), console)
+
+
+def _print_methods(
+    result: Result, console: Console, scope: str, *, with_improvement: bool = False
+) -> None:
+    """Prints a table of methods under a title, which may be wider than the table."""
+    _say([f"[italic]{_title(result.evaluation, scope)}"], console)
+    console.print(methods_table(result, scope, with_improvement=with_improvement))
 
 
 def _in_short(result: Result) -> str:
@@ -112,7 +120,7 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
     With `with_improvement` a column says by how much the policy is better than each other method.
     """
     evaluation, metrics = result.evaluation, result.metrics
-    table = Table(title=_title(evaluation, scope), title_justify="left")
+    table = Table()
     table.add_column("method", no_wrap=True)
     shown = []
     for metric in evaluation.measured:
@@ -149,10 +157,10 @@ def _title(evaluation: Evaluation, scope: str) -> str:
     fits = evaluation.tables.get("fits")
     part = scope_label(scope)
     if scope == "test" and fits is not None and "test_rmse_speed" not in fits:
-        part = "all of what was calibrated on,"
+        part = "all of what was calibrated on"
     pairs = plural(len(evaluation.trajectories), "pair")
     drivers = plural(evaluation.about["driver"].nunique(), "driver")
-    return f"{pairs} of {drivers}, {part} in closed loop"
+    return f"{pairs} of {drivers}, {part}, in closed loop"
 
 
 def _improvement_cell(improvement: Improvement) -> str:

@@ -34,6 +34,15 @@ def normal_paths(spread: float, count: int, seed: int) -> Paths:
     return Paths(torch.as_tensor(speed), torch.as_tensor(travelled))
 
 
+def named_pairs(count: int) -> Any:
+    """Returns pairs of which only the names and drivers are asked for."""
+    names, drivers = [], []
+    for number in range(count):
+        names.append(f"p{number}")
+        drivers.append(f"d{number}")
+    return SimpleNamespace(ids=names, drivers=drivers)
+
+
 @pytest.fixture(scope="module")
 def table() -> pd.DataFrame:
     """Of a calibrated method, of one that is too sure, and of one that gives a single path."""
@@ -52,7 +61,7 @@ def table() -> pd.DataFrame:
         "too sure": normal_paths(0.3, 20, 1),
         "single": Paths(middle.speed[0], middle.travelled[0]),
     }
-    pairs: Any = [SimpleNamespace(pair_id=f"p{i}", driver=f"d{i}") for i in range(10)]
+    pairs = named_pairs(10)
     index = torch.arange(ORIGINS) % 10
     origins = Origins(index, torch.zeros_like(index))
     return score_distributions(pairs, origins, paths, happened, (1.0, 2.0), DT)
@@ -70,7 +79,7 @@ def test_a_horizon_that_no_recording_lasts_to_is_left_out() -> None:
         leader_travelled=still,
         exists=exists,
     )
-    pairs: Any = [SimpleNamespace(pair_id=f"p{i}", driver=f"d{i}") for i in range(3)]
+    pairs = named_pairs(3)
     index = torch.arange(3)
     origins = Origins(index, torch.zeros_like(index))
     none = torch.zeros(20, 3, STEPS + 1)

@@ -43,6 +43,7 @@ SLOW = {"nuts"}
 NAMES = [
     pytest.param(entry.name, marks=[pytest.mark.slow] if entry.name in SLOW else [])
     for entry in registry.entries("posterior")
+    if entry.distribution == "cfx-posteriors"
 ]
 
 

@@ -86,7 +86,7 @@ def _of_folder(folder: Path, place: Callable[[Path], str]) -> list[Result | Unfi
 def _of_mlflow(run: str) -> list[Result | Unfinished]:
     found: list[Result | Unfinished] = []
     for one in tracking_of_run(run).jobs_of_run(run):
-        found.append(Unfinished(one.place, one.reason) if one.folder is None else read_result(one))
+        found.append(Unfinished(one.place, one.reason) if one.folder is None else _whole(one))
     if not any(isinstance(one, Result) for one in found):
         raise DataError(f"run {run} holds no finished job{_reasons(found)}")
     return found
@@ -110,9 +110,17 @@ def _job_folders(folder: Path) -> Iterator[Path]:
             below[:] = sorted(set(below) - _PASSED_OVER, key=natural_order)
 
 
+def _whole(origin: Origin) -> Result:
+    """Reads a job with all of its tables, so that a damaged one is named before a page is made."""
+    job = read_result(origin)
+    for name in job.tables:
+        _ = job.tables[name]
+    return job
+
+
 def _one(folder: Path, place: str) -> Result | Unfinished:
     if (folder / "metrics.json").is_file():
-        return read_result(Origin(place, folder))
+        return _whole(Origin(place, folder))
     status = job_folder.optional(folder / "outcome.json", job_folder.read_json) or {}
     if status.get("code"):
         return Unfinished(place, f"failed: {without_passwords(str(status.get('message', '')))}")

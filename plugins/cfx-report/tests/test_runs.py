@@ -99,7 +99,7 @@ def test_what_a_job_says_of_itself(tmp_path: Path) -> None:
     assert job.methods == ACROSS
     assert job.baselines() == ("fixed", "default", "population")
     assert job.baselines("full_trajectory") == ("default", "population")
-    assert (job.experiment, job.overrides, job.seconds) == (
+    assert (job.setting("preset") or "", job.overrides, job.seconds) == (
         "paper/clusters",
         ("model=krauss",),
         65.0,
@@ -115,7 +115,7 @@ def test_a_job_that_lacks_files_is_still_read(tmp_path: Path) -> None:
     shutil.rmtree(tmp_path / "job" / ".hydra")
     (job,) = read_runs([str(tmp_path / "job")]).jobs
     assert set(job.missing) == {"trajectories.parquet", "curves.parquet", "style.csv"}
-    assert (job.experiment, job.overrides, job.started) == ("", None, None)
+    assert (job.setting("preset") or "", job.overrides, job.started) == ("", None, None)
 
 
 @pytest.mark.parametrize(

@@ -8,13 +8,13 @@ from typing import Any
 
 import pytest
 
+from cfx.core import registry
 from cfx.core.registry import Installed, installed
 from cfx.figures.canvas import blank
 from cfx_report import page
 from cfx_report.jobs import Runs
 from cfx_report.runs import read_runs
 from cfx_report.section import Column, Section, Sheet, View, number
-from cfx_report.sections import figures
 from tests.job_folders import write_job
 from tests.pages import HOSTILE, Page
 
@@ -89,8 +89,7 @@ def test_a_further_section_needs_nothing_but_a_template_and_its_context(
         name = type(section).__name__.lower()
         added.append(Installed("section", name, section, "somebody-else"))
     known = {"section": (*installed("section")[-2:], *added), "figure": installed("figure")}
-    for module in (page, figures):
-        monkeypatch.setattr(module, "installed", known.__getitem__)
+    monkeypatch.setattr(registry, "installed", known.__getitem__)
     found = Page(page.render(runs))
     for words in (
         "A further section",

@@ -707,7 +707,7 @@ def test_in_sumo_a_policy_drives_as_in_memory(
         ),
     }
     evaluation = evaluate(
-        ComparedPairs(pairs, batch, first, style_of(pairs)), {"test": loops}, model.space, seed=0
+        ComparedPairs(pairs, batch, first, style_of(pairs)), {"test": loops}, model.space
     )
     knowledge = PolicyKnowledge("fixed", history)
     job = FinishedJob(pairs, policy, evaluation, tmp_path / "policy", knowledge)
