@@ -85,17 +85,19 @@ def build_library(source: str, *options: str) -> ctypes.CDLL | None:
 def remembered(key: str | None, make: Callable[[], str]) -> str:
     """Returns the text that `make` gives, kept for later processes under a key; None: not kept.
 
-    Recording a step takes seconds, most of them in importing PyTorch's tracer.
+    Recording a step takes seconds, most of them in importing PyTorch's tracer. No text, where a
+    step cannot be recorded, is not kept: `make` says why in each process.
     """
     if key is None:
         return make()
     path = cache_folder() / f"{key}.cpp"
     try:
-        if path.is_file():
+        if path.is_file() and path.stat().st_size:
             return path.read_text(encoding="utf-8")
         text = make()
-        with atomic_write(path) as temporary:
-            temporary.write_text(text, encoding="utf-8")
+        if text:
+            with atomic_write(path) as temporary:
+                temporary.write_text(text, encoding="utf-8")
     except OSError as error:
         log.info("The cache of kernels cannot be used (%s)", error)
         return make()
