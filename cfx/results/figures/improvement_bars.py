@@ -267,13 +267,8 @@ def _closer(series: ImprovementSeries) -> list[Line2D | Patch]:
 def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | Patch]:
     """Draws the summary's lines and returns their legend entries, which carry the numbers."""
     handles: list[Line2D | Patch] = []
-    ends = (summary.ci95_low, summary.ci95_high)
-    if np.isfinite(ends).all():
-        axes.axhspan(*ends, color="#000000", alpha=0.13, linewidth=0, zorder=0.5)
-        text = f"its 95 % interval: {wording.percent(ends[0], 1)} to {wording.percent(ends[1], 1)}"
-        handles.append(Patch(color="#000000", alpha=0.13, label=text))
     lines: tuple[tuple[str, float, canvas.Dash, float], ...] = (
-        ("improvement (geometric mean over drivers)", summary.geometric, "solid", 1.8),
+        ("improvement (geometric)", summary.geometric, "solid", 1.8),
         ("of the mean errors", summary.ratio_of_means, (0, (5, 1.8)), 1.4),
         ("median", summary.median, (0, (1.2, 1.4)), 1.6),
     )
@@ -284,6 +279,11 @@ def _statistics(axes: Axes, summary: Improvement, low: float) -> list[Line2D | P
         if value < low:
             text += " (below the axis)"
         handles.append(Line2D([], [], color="black", linestyle=dash, linewidth=width, label=text))
+    ends = (summary.ci95_low, summary.ci95_high)
+    if np.isfinite(ends).all():
+        axes.axhspan(*ends, color="#000000", alpha=0.13, linewidth=0, zorder=0.5)
+        text = f"95 % interval {wording.percent(ends[0], 1)} to {wording.percent(ends[1], 1)}"
+        handles.insert(1, Patch(color="#000000", alpha=0.13, label=text))
     return handles
 
 
