@@ -22,12 +22,15 @@ def override(key: str, value: Any) -> str:
 
 
 def config_of(settings: Mapping[str, Any]) -> JobConfig:
-    """Composes a configuration as the command line does; settings that are None are usual.
+    """Composes a configuration as the command line does; None is `null`, and so is "null".
 
     Raises:
         CfxError: a name or a value is wrong.
     """
-    overrides = [override(key, value) for key, value in settings.items() if value is not None]
+    overrides = []
+    for key, value in settings.items():
+        is_null = isinstance(value, str) and value == "null"
+        overrides.append(override(key, None if is_null else value))
     with explained(overrides):
         values = hydra_source.plain(hydra_source.composed(overrides))
     return JobConfig.of(values)

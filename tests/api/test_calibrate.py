@@ -239,6 +239,23 @@ def test_a_simulation_refuses(error: type[CfxError], said: str, given: dict[str,
         cfx.simulate("idm", **given)
 
 
+@pytest.mark.parametrize("nothing", [None, "null"])
+def test_none_and_null_lift_what_a_setting_limits(nothing: str | None) -> None:
+    """A leader that stops dead: without limits Krauss brakes as hard as its gap asks for."""
+    speed = np.concatenate([np.full(20, 20.0), np.zeros(80)])
+    leader = pd.DataFrame({"time_s": 0.1 * np.arange(100), "speed": speed})
+    braking = {}
+    limits: dict[str, dict[str, Any]] = {"usual": {}, "lifted": {"model.limits": nothing}}
+    for name, settings in limits.items():
+        simulated = cfx.simulate(
+            "krauss", {"t_r": 1.0}, leader=leader, gap=25.0, speed=20.0, **settings
+        )
+        braking[name] = float(simulated["acceleration"].min())
+    assert braking["usual"] >= -9.0 - 1e-6
+    assert braking["lifted"] < -9.0
+    assert cfx.config(model="krauss", **{"model.limits": nothing}).config.model["limits"] is None
+
+
 def test_a_fit_of_another_model_is_refused(fit: cfx.Fit, pairs: cfx.Pairs) -> None:
     with pytest.raises(ConfigError, match="parameters are of model=idm"):
         cfx.simulate("krauss", fit, pairs)
