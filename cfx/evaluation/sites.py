@@ -92,18 +92,20 @@ def _row(
             row[f"rmse_gap_{method}"] = float(own_gap[method].mean())
     for baseline in BASELINES:
         if baseline in speed and "policy" in speed:
-            one = improvement_statistics(
+            improvement = improvement_statistics(
                 own_speed[baseline].to_numpy(),
                 own_speed["policy"].to_numpy(),
                 about["driver"].tolist(),
             )
-            row |= _improvement(baseline, one.geometric, one.median, one.ci95_low, one.ci95_high)
+            low, high = improvement.ci95_low, improvement.ci95_high
+            row |= _columns_of(baseline, improvement.geometric, improvement.median, low, high)
     return row
 
 
-def _improvement(
+def _columns_of(
     baseline: str, geometric: float, median: float, low: float, high: float
 ) -> dict[str, float]:
+    """Returns the columns of an improvement over a baseline."""
     name = f"over_{baseline}"
     return {name: geometric, f"{name}_median": median, f"{name}_low": low, f"{name}_high": high}
 
@@ -135,5 +137,5 @@ def _mean_of_sites(
                 about["site"].tolist(),
             )
             median = float(table[f"over_{baseline}_median"].mean())
-            row |= _improvement(baseline, geometric, median, low, high)
+            row |= _columns_of(baseline, geometric, median, low, high)
     return row

@@ -97,6 +97,11 @@ class Improvement:
         return {name: float(getattr(self, name)) for name in STATISTICS}
 
 
+def are_comparable(baseline: Floats, errors: Floats) -> NDArray[np.bool_]:
+    """Returns which pairs count, `(P,)`: the ratio of their two errors has a finite logarithm."""
+    return np.isfinite(baseline) & np.isfinite(errors) & (baseline > 0) & (errors > 0)
+
+
 def improvement_statistics(
     baseline: Floats, errors: Floats, drivers: Sequence[str] | None = None
 ) -> Improvement:
@@ -108,13 +113,12 @@ def improvement_statistics(
         errors: that of the other method, `(P,)`, in the same unit.
         drivers: the driver of each pair, `(P,)`; None if each pair has a driver of its own.
     """
-    counts = np.isfinite(baseline) & np.isfinite(errors) & (baseline > 0) & (errors > 0)
+    counts = are_comparable(baseline, errors)
     if not counts.any():
         unknown = dict.fromkeys(STATISTICS[:-1], math.nan)
         return Improvement(**unknown, pairs=0, undefined=len(baseline), drivers=0)
     before, after = baseline[counts], errors[counts]
-    driver = _numbered(drivers, counts)
-    logarithms = np.bincount(driver, np.log(after / before)) / np.bincount(driver)
+    logarithms = _logarithms(before, after, _numbered(drivers, counts))
     low, high, p_value = _t_interval(logarithms)
     gain = (before - after) / before
     dropped = int(_TRIMMED * len(gain))
@@ -167,6 +171,11 @@ def _numbered(drivers: Sequence[str] | None, counts: NDArray[np.bool_]) -> NDArr
     return np.unique(np.asarray(drivers)[counts], return_inverse=True)[1]
 
 
+def _logarithms(before: Floats, after: Floats, driver: NDArray[np.intp]) -> Floats:
+    """Returns each driver's mean of the logarithms of their pairs' ratios, `(drivers,)`."""
+    return np.bincount(driver, np.log(after / before)) / np.bincount(driver)
+
+
 def _t_interval(values: Floats) -> tuple[float, float, float]:
     """Returns the 95 % t interval of a mean and the p value of its being 0; NaN of one value."""
     from scipy.special import stdtr
@@ -204,15 +213,12 @@ def geometric_over_sites(
         sites: the site of each pair, `(P,)`.
     """
     means, variances, numbers = [], [], []
-    of_site = np.asarray(sites)
+    of_site, comparable = np.asarray(sites), are_comparable(baseline, errors)
     for site in dict.fromkeys(sites):
-        here = of_site == site
-        counts = np.isfinite(baseline) & np.isfinite(errors) & (baseline > 0) & (errors > 0) & here
+        counts = comparable & (of_site == site)
         if not counts.any():
             continue
-        driver = _numbered(drivers, counts)
-        ratios = np.log(errors[counts] / baseline[counts])
-        logarithms = np.bincount(driver, ratios) / np.bincount(driver)
+        logarithms = _logarithms(baseline[counts], errors[counts], _numbered(drivers, counts))
         means.append(float(logarithms.mean()))
         numbers.append(len(logarithms))
         variances.append(float(logarithms.var(ddof=1)) if len(logarithms) > 1 else math.nan)

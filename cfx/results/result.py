@@ -29,7 +29,7 @@ from cfx.errors import DataError, listed
 from cfx.evaluation.headline import headline, improvement_key
 from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo, column_of, key_of
 from cfx.evaluation.result import METHODS, Evaluation, PairTrajectory, Purpose
-from cfx.evaluation.statistics import STATISTICS, Improvement
+from cfx.evaluation.statistics import STATISTICS, Improvement, are_comparable
 from cfx.evaluation.tables import scope_label
 from cfx.figures.drawing import as_html, drawn, remove_figures, write_figures
 from cfx.policies import checkpoint
@@ -387,7 +387,7 @@ class Result:
         if baseline not in errors or "policy" not in errors:
             return pd.Series(dtype=object)
         before, after = errors[baseline], errors["policy"]
-        is_defined = np.isfinite(before) & np.isfinite(after) & (before > 0) & (after > 0)
+        is_defined = are_comparable(before.to_numpy(float), after.to_numpy(float))
         drivers = rows.drop_duplicates("pair_id").set_index("pair_id")["driver"]
         return drivers[drivers.index.isin(errors.index[is_defined])]
 

@@ -167,10 +167,14 @@ def _improvement_cell(improvement: Improvement) -> str:
     """Returns an improvement with its interval, in percent."""
     if not improvement.pairs:
         return "not defined"
-    interval = "one driver"
-    if math.isfinite(improvement.ci95_low):
-        interval = f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"
-    return f"{100 * improvement.geometric:+.1f} ({interval})"
+    return f"{100 * improvement.geometric:+.1f} ({_interval(improvement)})"
+
+
+def _interval(improvement: Improvement) -> str:
+    """Returns the interval of an improvement, in percent."""
+    if not math.isfinite(improvement.ci95_low):
+        return "one driver"
+    return f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"
 
 
 def _fitted(evaluation: Evaluation) -> pd.DataFrame:
@@ -243,14 +247,11 @@ def _improvements_table(compared: Mapping[str, Improvement]) -> Table:
         if improvement.pairs == 0:
             table.add_row(over, "not defined")
             continue
-        interval = "one driver"
-        if math.isfinite(improvement.ci95_low):
-            interval = f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"
         p_value = f"{improvement.p_value:.2g}" if math.isfinite(improvement.p_value) else ""
         table.add_row(
             over,
             f"{100 * improvement.geometric:+.1f}",
-            interval,
+            _interval(improvement),
             f"{100 * improvement.ratio_of_means:+.1f}",
             f"{improvement.win_rate * improvement.pairs:.0f} of {improvement.pairs}",
             p_value,

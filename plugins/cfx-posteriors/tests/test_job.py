@@ -10,17 +10,7 @@ import pytest
 import cfx
 from cfx.errors import ConfigError
 from cfx.models.krauss import Krauss
-
-QUICK = [
-    "debug=quick",
-    "policy=fixed",
-    "data.pairs=3",
-    "data.platoon_size=1",
-    "data.frames=400",
-    "data.max_pairs=null",
-    "figures=none",
-    "tracking.enabled=false",
-]
+from tests.test_job_posterior import QUICK
 
 
 @pytest.fixture(autouse=True)
