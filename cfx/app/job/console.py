@@ -225,12 +225,12 @@ def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
         ("test", "population", ""),
         ("full_trajectory", "population", ", full"),
     ]
-    found = {}
+    compared = {}
     for scope, baseline, part in candidates:
         improvements = evaluation.improvements.get(scope, {})
         if baseline in improvements:
-            found[f"{short_label(baseline)}{part}"] = improvements[baseline]
-    return found
+            compared[f"{short_label(baseline)}{part}"] = improvements[baseline]
+    return compared
 
 
 def _improvements_table(compared: Mapping[str, Improvement]) -> Table:
@@ -271,10 +271,13 @@ def _safety(evaluation: Evaluation, metrics: Mapping[str, float]) -> list[str]:
     lines = [" ".join(sentences)] if sentences else []
     shares = flat_for(evaluation.table, evaluation.names)
     pairs = int((evaluation.about["method"] == "fixed").sum())
-    found = [f"{name} for {share * pairs:.0f}" for name, share in shares.items() if share > 0]
-    if found:
+    undetermined = []
+    for name, share in shares.items():
+        if share > 0:
+            undetermined.append(f"{name} for {share * pairs:.0f}")
+    if undetermined:
         lines.append(
-            f"Not determined: {', '.join(found)} of {pairs} pairs (within"
+            f"Not determined: {', '.join(undetermined)} of {pairs} pairs (within"
             f" {100 * NEARLY_BEST:.0f} % of the best loss from bound to bound;"
             " flat_NAME is 1 in pairs.csv)."
         )
@@ -285,12 +288,12 @@ def _methods_above(
     evaluation: Evaluation, metrics: Mapping[str, float], name: str, least: float, form: str
 ) -> str:
     """Lists the methods whose metric is at least so much, with its value."""
-    found = []
+    methods = []
     for method in evaluation.methods:
         value = metrics.get(key_of(name, method), 0.0)
         if value >= least:
-            found.append(f"{short_label(method)} {value:{form}}")
-    return ", ".join(found)
+            methods.append(f"{short_label(method)} {value:{form}}")
+    return ", ".join(methods)
 
 
 def described(result: Result) -> str:
