@@ -68,7 +68,7 @@ import torch
 from cfx.plugin import Optimizer
 
 class Bad(Optimizer):
-    def evaluations(self):
+    def evaluations(self, n):
         return 4
 
     def bytes_per_problem(self, n):

@@ -94,7 +94,7 @@ import torch
 from cfx.plugin import Optimizer
 
 class Mixed(Optimizer):
-    def evaluations(self):
+    def evaluations(self, n):
         return 8
 
     def bytes_per_problem(self, n):

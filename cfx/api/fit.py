@@ -15,6 +15,7 @@ import pandas as pd
 
 from cfx.api.experiment import Experiment, config
 from cfx.api.pairs import Pairs, PairsLike, pairs_from
+from cfx.calibration.settings import APART
 from cfx.core.guest import visit
 from cfx.errors import ConfigError
 
@@ -85,11 +86,20 @@ class Fit:
 
         `train_rmse_speed` (m/s) and `train_rmse_gap` (m) are of the part that was calibrated on,
         `test_...` of the rest, simulated in closed loop from the last measured state before it;
-        with `split=1` there is no rest.
+        with `split=1` there is no rest. `ends_apart` is of `fixed`: see `Fit.ends_apart`.
         `method` is `default`, `population` (pooled) or `fixed` (driver-specific).
         """
         with visit():
             return pd.concat([self._errors(method) for method in METHODS], ignore_index=True)
+
+    @property
+    def ends_apart(self) -> pd.Series:
+        """By which share of the loss independent ends of each pair's search differ.
+
+        Above 0.01 the optimum may have been missed; NaN where the optimizer has no such ends.
+        """
+        apart = self._context.calibrator.apart(self._context.pairs, self._last)
+        return pd.Series(apart, self.parameters.index, name="ends_apart")
 
     def summary(self) -> pd.DataFrame:
         """Returns a row per parameter: its unit, default, pooled value, and the drivers' spread.
@@ -216,6 +226,8 @@ class Fit:
             "train_rmse_speed": train["rmse_speed"].cpu().numpy(),
             "train_rmse_gap": train["rmse_gap"].cpu().numpy(),
         }
+        if method == "fixed" and self.ends_apart.notna().any():
+            errors["ends_apart"] = self.ends_apart.to_numpy()
         if context.split < 1:
             agent = context.constant(FixedPolicy(), parameters)
             each = torch.arange(len(batch), device=batch.lengths.device)
@@ -233,9 +245,11 @@ class Fit:
         found = self.losses.groupby("method")[f"{part}_rmse_speed"].mean()
         where = "the test part" if part == "test" else "what was calibrated on"
         means = [f"{short_label(method)} {found[method]:.3f}" for method in METHODS]
+        missed = int((self.ends_apart > APART).sum())
+        doubt = f"; the optimum of {missed} may have been missed" if missed else ""
         return (
             f"Fit({self.model}, {len(self.parameters)} pairs; RMSE of speed on {where}, m/s:"
-            f" {', '.join(means)})"
+            f" {', '.join(means)}{doubt})"
         )
 
     def _repr_html_(self) -> str:

@@ -139,14 +139,14 @@ class BotorchOptimizer(Optimizer):
     }
     in_shards = True
 
-    def evaluations(self) -> int:
-        return self.space_filling() + self.settings.iterations
+    def evaluations(self, n: int) -> int:
+        return self.space_filling(n) + self.settings.iterations
 
-    def space_filling(self) -> int:
+    def space_filling(self, n: int) -> int:
         return self.settings.screening + self.settings.initial
 
-    def evaluations_at_once(self) -> int:
-        return min(AT_ONCE, self.space_filling())
+    def evaluations_at_once(self, n: int) -> int:
+        return min(AT_ONCE, self.space_filling(n))
 
     def bytes_per_problem(self, n: int) -> int:
         # Measured: a fit holds about 24 matrices (seen, seen) for its gradient, LogEI about 8 of
@@ -162,7 +162,7 @@ class BotorchOptimizer(Optimizer):
         settings = self.settings
         problems, g, n = guesses.shape
         check_room(settings.initial, g, key="initial")
-        points = sobol(self.space_filling() - g, n, seed=seed, device=guesses.device)
+        points = sobol(self.space_filling(n) - g, n, seed=seed, device=guesses.device)
         tried = torch.cat([guesses, points.expand(problems, -1, -1)], dim=1)
         losses = objective(tried)
         search = _BatchSearch(settings, tried, losses, guesses=g, seed=seed)

@@ -8,8 +8,9 @@ where it stopped.
 from __future__ import annotations
 
 import itertools
+import logging
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -22,6 +23,8 @@ from torch import Tensor
 
 from cfx.calibration.cache import Arrays, Cache, first_fit
 from cfx.calibration.objectives import Objective
+from cfx.calibration.optimizers import Optimizer
+from cfx.calibration.settings import APART
 from cfx.calibration.shards import CalibrationShard, PooledShard, SegmentShard, Solver
 from cfx.core import memory
 from cfx.core.component import content_key
@@ -31,6 +34,8 @@ from cfx.core.parameters import ParameterSpace
 from cfx.core.progress import Task
 from cfx.data.pairs import Pair, PairBatch, PairSet
 from cfx.simulation.windows import Windows, WindowSettings
+
+log = logging.getLogger(__name__)
 
 _CLAIM = 1024
 """Problems that are claimed and solved together: enough to fill the batch, few enough that an
@@ -42,6 +47,9 @@ windows."""
 
 _FRAMES_AT_ONCE = 200_000
 """Frames of trajectories that are simulated at once to report their losses: some 30 MB."""
+
+_NAMED = 3
+"""Pairs that a warning names."""
 
 _WINDOWS_OF_ENTRY = 32
 """Windows of an entry of the cache: the first windows of a pair have the same labels, however many
@@ -138,6 +146,7 @@ class Calibrator:
         self.progress = progress
         self.reported = reported or {}
         self.engine = engine or LocalEngine()
+        self._apart: dict[str, float] = {}
 
     @property
     def space(self) -> ParameterSpace:
@@ -165,10 +174,7 @@ class Calibrator:
         requested_device, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         last = last.to(device)
-        keys = []
-        for pair, end in zip(pairs, last.tolist(), strict=True):
-            keys.append(self._key("fixed", pair.fingerprint, frames=end, **self._prior_key))
-
+        keys = self._keys_of_fixed(pairs, last)
         compiled = self._has_kernel(batch)
 
         def shard(chosen: Tensor, claim: Tensor) -> SegmentShard:
@@ -187,7 +193,39 @@ class Calibrator:
         title = "Driver-specific parameters"
         sizes = [1] * len(pairs)
         results = self._cached(title, keys, sizes, shard, at_most=_TRAJECTORIES_OF_SHARD)
+        for key, entry in zip(keys, results, strict=True):
+            self._apart[key] = float(entry.get("apart", math.nan))
+        apart = self.apart(pairs, last)
+        missed = [pair.pair_id for pair, share in zip(pairs, apart, strict=True) if share > APART]
+        if missed:
+            named = ", ".join(missed[:_NAMED]) + (" ..." if len(missed) > _NAMED else "")
+            log.warning(
+                "The optimum of %d of %d pairs may have been missed (%s): independent ends of the"
+                " search differ by more than %.0f %% of the loss (ends_apart in fits.parquet);"
+                " there may be several ways to drive like them",
+                len(missed),
+                len(pairs),
+                named,
+                100 * APART,
+            )
         return _stacked(results, requested_device)
+
+    def apart(self, pairs: Iterable[Pair], last: Tensor) -> list[float]:
+        """Returns how far the ends of the search of each pair's parameters were apart.
+
+        See `Solution.apart`. NaN where the optimizer has no such ends, or `fixed` was not asked.
+
+        Args:
+            pairs: P pairs.
+            last: `(P,)`, as in `fixed`.
+        """
+        return [self._apart.get(key, math.nan) for key in self._keys_of_fixed(pairs, last)]
+
+    def _keys_of_fixed(self, pairs: Iterable[Pair], last: Tensor) -> list[str]:
+        keys = []
+        for pair, end in zip(pairs, last.tolist(), strict=True):
+            keys.append(self._key("fixed", pair.fingerprint, frames=end, **self._prior_key))
+        return keys
 
     def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
         """Finds one parameter set for each of K groups of pairs: the pooled parameters.
@@ -211,18 +249,17 @@ class Calibrator:
             group = _group_key(pairs, last, row)
             keys.append(self._key("population", "", pairs=group, **self._prior_key))
 
-        compiled = self._has_kernel(batch)
+        compiled, brief = self._has_kernel(batch), self.solver.brief
+        code = content_key(brief.scope)
 
         def shard(chosen: Tensor, _claim: Tensor) -> PooledShard:
             groups = members[chosen].to(device)
             used = groups.any(0).nonzero()[:, 0]
             trajectories = batch[used].trimmed()
-            return PooledShard(
-                self.solver, self._code, compiled, trajectories, last[used], groups[:, used]
-            )
+            return PooledShard(brief, code, compiled, trajectories, last[used], groups[:, used])
 
         # One shard: groups have candidates in common, and what is simulated for one serves all.
-        results = self._cached("Pooled parameters", keys, [1] * len(members), shard)
+        results = self._cached("Pooled parameters", keys, [1] * len(members), shard, solver=brief)
         return _stacked(results, requested_device)
 
     def labels(
@@ -259,7 +296,8 @@ class Calibrator:
         pair_of_entry = torch.tensor(owner)
         first_of_entry, size_of_entry = torch.tensor(begin), torch.tensor(sizes)
 
-        compiled = self._has_kernel(batch)
+        compiled, brief = self._has_kernel(batch), self.solver.brief
+        code = content_key(brief.scope)
 
         def shard(chosen: Tensor, _claim: Tensor) -> SegmentShard:
             count = size_of_entry[chosen]
@@ -271,8 +309,8 @@ class Calibrator:
             window = first_of_entry[chosen][entry] + number
             start = (window * windows.settings.stride).to(device)
             return SegmentShard(
-                self.solver,
-                self._code,
+                brief,
+                code,
                 compiled,
                 batch[used].trimmed(),
                 pair=place[entry].to(device),
@@ -284,7 +322,7 @@ class Calibrator:
             )
 
         title = "Per-window calibrated parameters (labels)"
-        results = self._cached(title, keys, sizes, shard, **description)
+        results = self._cached(title, keys, sizes, shard, solver=brief, **description)
         joined = {}
         for name in results[0]:
             values = np.concatenate([entry[name] for entry in results])
@@ -356,6 +394,7 @@ class Calibrator:
         problems: list[int],
         shard: Callable[[Tensor, Tensor], CalibrationShard],
         at_most: int = _CLAIM,
+        solver: Solver | None = None,
         **scope: Any,
     ) -> list[Arrays]:
         """Returns one entry per key; solves what neither the cache nor another process provides.
@@ -367,18 +406,20 @@ class Calibrator:
             shard: takes the numbers of entries, and those of the claim that they are cut from, and
                 returns what solves these entries.
             at_most: problems in each shard, where claims are cut.
+            solver: of these shards; the calibrator's own unless given.
             scope: settings that all keys share, besides those of the calibrator.
         """
-        optimizer = self.solver.optimizer
+        optimizer = (solver or self.solver).optimizer
         shard_size, enough = _CLAIM, float(_CLAIM)
         if optimizer.in_shards or (optimizer.in_threads and self.engine.distributes):
             shard_size = min(at_most, _CLAIM)
         if self.engine.distributes:
             # Its workers share all that there is: it is claimed at once.
             enough = math.inf
-        work = _Work(self.cache, keys, problems, optimizer.evaluations(), shard_size)
+        evaluations = optimizer.evaluations(len(self.space))
+        work = _Work(self.cache, keys, problems, evaluations, shard_size)
         missing = work.missing_by_cache_shard(self._key(what, "", **scope))
-        with self.progress(self._title(what, work), work.missing_evaluations) as task:
+        with self.progress(self._title(what, work, optimizer), work.missing_evaluations) as task:
             while missing:
                 with self.cache.claim(work.sizes(missing), enough) as claimed:
                     entries = {name: missing.pop(name) for name in claimed}
@@ -390,9 +431,9 @@ class Calibrator:
                             work.keep(cuts[number].entries, solution)
         return work.results()
 
-    def _title(self, what: str, work: _Work) -> str:
+    def _title(self, what: str, work: _Work, optimizer: Optimizer) -> str:
         """Returns what a progress display says."""
-        optimizer, objective = self.solver.optimizer, self.solver.objective
+        objective = self.solver.objective
         minimised = type(objective).__name__
         if objective.unit:
             minimised = f"{minimised} in {objective.unit}"
@@ -404,7 +445,8 @@ class Calibrator:
         Whether work is compiled depends on how much there is, and its last bits on that: `steps`
         of all problems of the claim, for one candidate.
         """
-        stepper = self.solver.stepper.for_work(steps * self.solver.optimizer.evaluations())
+        evaluations = self.solver.optimizer.evaluations(len(self.space))
+        stepper = self.solver.stepper.for_work(steps * evaluations)
         return replace(self.solver, stepper=stepper)
 
     @cached_property

@@ -102,19 +102,21 @@ def float32_agrees_with_float64(objective: Objective) -> None:
 
 def says_how_much_it_does_in_whole_numbers(optimizer: Optimizer) -> None:
     numbers = {
-        "evaluations()": optimizer.evaluations(),
-        "evaluations_at_once()": optimizer.evaluations_at_once(),
-        "space_filling()": optimizer.space_filling(),
+        "evaluations(n)": optimizer.evaluations(5),
+        "evaluations_at_once(n)": optimizer.evaluations_at_once(5),
+        "returned(n)": optimizer.returned(5),
+        "space_filling(n)": optimizer.space_filling(5),
         "bytes_per_problem(n)": optimizer.bytes_per_problem(5),
     }
     for name, value in numbers.items():
         least = int(name != "bytes_per_problem(n)")
         assert type(value) is int, f"{name} gives {value!r}; it must give a whole number"
         assert value >= least, f"{name} gives {value}; it must give at least {least}"
-    assert numbers["space_filling()"] <= numbers["evaluations()"], (
-        f"space_filling() gives more than the {numbers['evaluations()']} evaluations that"
-        " evaluations() gives: the sensitivity, which weighs windows, is measured over the first"
-        " of them"
+    assert numbers["space_filling(n)"] <= numbers["returned(n)"] <= numbers["evaluations(n)"], (
+        f"space_filling(n) gives {numbers['space_filling(n)']}, returned(n)"
+        f" {numbers['returned(n)']} and evaluations(n) {numbers['evaluations(n)']}: a search"
+        " returns no more than it evaluates, and the sensitivity, which weighs windows, is measured"
+        " over the first of what it returns"
     )
 
 

@@ -93,12 +93,12 @@ class GradientSearch(RandomSearch):
     settings: GradientSettings
     trial: ClassVar[Mapping[str, Any]] = {"samples": 512}
 
-    def space_filling(self) -> int:
+    def space_filling(self, n: int) -> int:
         return self.settings.first
 
     def bytes_per_problem(self, n: int) -> int:
         matrices = self.settings.searches * n * (4 * n + 20)
-        return 8 * (self.evaluations() * (n + 2) + matrices)
+        return 8 * (self.evaluations(n) * (n + 2) + matrices)
 
     def solve(
         self, objective: CandidateLosses, guesses: Tensor, *, seed: int
@@ -106,7 +106,7 @@ class GradientSearch(RandomSearch):
         problems, g, n = guesses.shape
         settings = self.settings
         check_room(settings.first, g, key="samples")
-        each_step = n + len(_LENGTHS)
+        each_step = evaluations_of_round(n)
         stages, rest = _stages(settings.searches, settings.samples - settings.first, each_step)
         points = sobol(settings.first - g + rest, n, seed=seed, device=guesses.device)
         shared = points.expand(problems, -1, -1)
@@ -116,16 +116,48 @@ class GradientSearch(RandomSearch):
         for searches, rounds in stages:
             search = _best(search, searches)
             for _ in range(rounds):
-                around = _around(search.point)
-                beside = objective(around.flatten(1, 2))
-                search = _with_slope(search, around, beside.view(around.shape[:3]))
-                steps = _steps(search)
-                lower = objective(steps.flatten(1, 2))
-                search = _stepped(search, steps, lower.view(steps.shape[:3]))
-                tried += [around.flatten(1, 2), steps.flatten(1, 2)]
-                losses += [beside, lower]
+                search, tried_now, losses_now = _round(search, objective)
+                tried += tried_now
+                losses += losses_now
         # The extra points stand before the searches, in the order of evaluation.
         return tuple(tried), torch.cat(losses, dim=1)
+
+
+def descend(
+    objective: CandidateLosses, points: Tensor, *, rounds: int, radius: float
+) -> tuple[Tensor, Tensor]:
+    """Searches locally from points `(P, S, n)`: returns where that leads, and the losses `(P, S)`.
+
+    Each takes `1 + rounds * evaluations_of_round(n)` evaluations.
+
+    Args:
+        objective: losses of P problems.
+        points: in unit space.
+        rounds: steps of each search.
+        radius: length of the first step in any coordinate.
+    """
+    search = _searches(points, objective(points), radius)
+    for _ in range(rounds):
+        search, _, _ = _round(search, objective)
+    return search.point, search.loss
+
+
+def evaluations_of_round(n: int) -> int:
+    """Returns the evaluations that one step of a search of n parameters takes."""
+    return n + len(_LENGTHS)
+
+
+def _round(
+    search: _LocalSearches, objective: CandidateLosses
+) -> tuple[_LocalSearches, list[Tensor], list[Tensor]]:
+    """Takes one step; returns the candidates that it tried too, and their losses."""
+    around = _around(search.point)
+    beside = objective(around.flatten(1, 2))
+    search = _with_slope(search, around, beside.view(around.shape[:3]))
+    steps = _steps(search)
+    lower = objective(steps.flatten(1, 2))
+    search = _stepped(search, steps, lower.view(steps.shape[:3]))
+    return search, [around.flatten(1, 2), steps.flatten(1, 2)], [beside, lower]
 
 
 def _stages(searches: int, samples: int, each_step: int) -> tuple[list[tuple[int, int]], int]:
@@ -174,15 +206,20 @@ def _start(losses: Tensor, guesses: Tensor, shared: Tensor, starts: int) -> _Loc
     if shared.shape[1]:
         place = (index - g).clamp(min=0)
         of_guess = of_guess.where((index < g)[..., None], shared[0][place])
-    nothing = torch.zeros_like(of_guess)
+    return _searches(of_guess, loss, _FIRST_RADIUS)
+
+
+def _searches(point: Tensor, loss: Tensor, radius: float) -> _LocalSearches:
+    """Returns searches that begin at points `(P, S, n)` with losses `(P, S)`."""
+    nothing = torch.zeros_like(point)
     return _LocalSearches(
-        point=of_guess,
+        point=point,
         loss=loss,
         slope=nothing,
         moved=nothing,
-        inverse=_identity(of_guess),
+        inverse=_identity(point),
         fresh=torch.ones_like(loss, dtype=torch.bool),
-        radius=torch.full_like(loss, _FIRST_RADIUS),
+        radius=torch.full_like(loss, radius),
     )
 
 

@@ -191,9 +191,10 @@ class SegmentLosses:
         steps = self.problems * self.steps * candidates
         return replace(self, stepper=self.stepper.for_work(steps))
 
-    def select(self, first: int, last: int) -> SegmentLosses:
-        """Returns problems `first` to `last - 1`."""
-        return self.take(slice(first, last))
+    def rough(self) -> SegmentLosses:
+        """Returns the same losses in float32: kernels take half the time."""
+        segments = Segments(*(values.float() for values in self.segments))
+        return replace(self, segments=segments)
 
     def take(self, problems: slice | Tensor) -> SegmentLosses:
         """Returns the problems of numbers `(S,)` int64; one may stand there more than once."""
@@ -384,12 +385,16 @@ class PooledLosses:
         stepper = self.segments.stepper.for_work(simulated * candidates)
         return replace(self, segments=replace(self.segments, stepper=stepper))
 
-    def select(self, first: int, last: int) -> PooledLosses:
-        """Returns problems `first` to `last - 1`."""
-        members = self.members[first:last]
+    def take(self, problems: slice | Tensor) -> PooledLosses:
+        """Returns some of the problems."""
+        members = self.members[problems]
         if self.prior is None:
             return replace(self, members=members)
-        return replace(self, members=members, prior=self.prior.cut(slice(first, last)))
+        return replace(self, members=members, prior=self.prior.cut(problems))
+
+    def rough(self) -> PooledLosses:
+        """Returns itself."""
+        return self
 
     @torch.no_grad()
     def __call__(self, candidates: Tensor) -> Tensor:

@@ -42,6 +42,11 @@ _LOSSES_AT_ONCE = 1 << 19
 """Losses of one shard on a CPU, at most: 4 MB, which are written and read again in its cache."""
 
 
+_SEARCHED_AT_ONCE = 32
+"""Problems of one shard on a CPU, at most, where `solve` returns a part of its evaluations: threads
+share shards. The same on any machine, since eager losses round by the size of a batch."""
+
+
 class CandidateLosses(Protocol):
     """The losses of candidates in P independent problems, which an optimizer minimises.
 
@@ -61,8 +66,15 @@ class CandidateLosses(Protocol):
         """
         ...
 
-    def select(self, first: int, last: int) -> CandidateLosses:
-        """Returns the losses of problems `first` to `last - 1` alone."""
+    def take(self, problems: slice | Tensor) -> CandidateLosses:
+        """Returns the losses of some problems alone: a slice of them, or their numbers `(S,)`."""
+        ...
+
+    def rough(self) -> CandidateLosses:
+        """Returns the same losses to about five digits in less time, or the same where none is.
+
+        For a search; what it ends with is evaluated again.
+        """
         ...
 
 
@@ -78,13 +90,17 @@ class Solution:
             (`Optimizer.space_filling`): neither guesses nor what an optimizer chose by looking at
             losses. The median of an even number is the lower of the middle two. NaN if none is
             finite.
-        diverged: `(P,)` int64, number of candidates whose loss was NaN or infinite.
+        diverged: `(P,)` int64, number of candidates that `solve` returned whose loss was NaN or
+            infinite.
+        apart: `(P,)`, by how much the second lowest of the ends of independent searches
+            (`Optimizer.ends`) is above the lowest, as a share of it; NaN where there are none.
     """
 
     best: Tensor
     loss: Tensor
     filling: Tensor
     diverged: Tensor
+    apart: Tensor
 
     @classmethod
     def joined(cls, shards: Sequence[Solution]) -> Solution:
@@ -94,6 +110,7 @@ class Solution:
             torch.cat([shard.loss for shard in shards]),
             torch.cat([shard.filling for shard in shards]),
             torch.cat([shard.diverged for shard in shards]),
+            torch.cat([shard.apart for shard in shards]),
         )
 
     @property
@@ -141,14 +158,19 @@ class Optimizer(Component):
             seed: the same for every shard; 0 is a seed like any other.
 
         Returns:
-            Candidates `(P, e, n)` and their losses `(P, e)` in the order of evaluation. Candidates
-            may be expanded views, and may come in blocks along e, a tuple of `(P, q, n)`: those
-            that all problems share then need no copy for each.
+            Candidates `(P, e, n)` and their losses `(P, e)`, `returned(n)` of each problem: the
+            first `space_filling(n)` and last `ends(n)` stand where these say. Candidates may be
+            expanded views, and may come in blocks along e, a tuple of `(P, q, n)`: those that all
+            problems share then need no copy for each.
         """
 
     @abstractmethod
-    def evaluations(self) -> int:
-        """Returns e, the number of evaluations of each problem."""
+    def evaluations(self, n: int) -> int:
+        """Returns the most evaluations of each problem.
+
+        Args:
+            n: number of parameters.
+        """
 
     @abstractmethod
     def bytes_per_problem(self, n: int) -> int:
@@ -160,16 +182,35 @@ class Optimizer(Component):
             n: number of parameters.
         """
 
-    def evaluations_at_once(self) -> int:
+    def returned(self, n: int) -> int:
+        """Returns e, how many evaluations of each problem `solve` returns; all by default."""
+        return self.evaluations(n)
+
+    def evaluations_at_once(self, n: int) -> int:
         """Returns the most candidates of one problem in one call of the losses; 1 by default."""
         return 1
 
-    def space_filling(self) -> int:
+    def space_filling(self, n: int) -> int:
         """Returns how many first evaluations are chosen without looking at losses.
 
-        Guesses are included. All evaluations unless overridden.
+        Guesses are included. All that are returned unless overridden.
         """
-        return self.evaluations()
+        return self.returned(n)
+
+    def ends(self, n: int) -> int:
+        """Returns how many of the last candidates are ends of independent global searches.
+
+        Where they differ, the optimum may have been missed. 0 by default: it is not known.
+        """
+        return 0
+
+    def brief(self) -> Optimizer:
+        """Returns the optimizer of labels and pooled parameters; itself by default.
+
+        There are hundreds of windows for each driver, and one evaluation of pooled parameters
+        simulates all drivers.
+        """
+        return self
 
     def minimize(
         self,
@@ -190,7 +231,8 @@ class Optimizer(Component):
             seed: the same seed gives the same result.
             objective_bytes: memory that the loss of one candidate of one problem needs.
             memory: bound in bytes for one shard; a shard holds at least one problem.
-            progress: called with the number of evaluations done since the last call.
+            progress: called with the number of evaluations done since the last call; where a search
+                ended early, with those left out too.
             tolerance: losses this close to the lowest, in their unit, count as equal besides those
                 that rounding makes equal.
 
@@ -200,28 +242,40 @@ class Optimizer(Component):
                 of evaluations than it says.
         """
         problems, _, n = guesses.shape
-        returned = 8 * self.evaluations() * (2 * n + 4)
-        each = self.bytes_per_problem(n) + returned + objective_bytes * self.evaluations_at_once()
-        require_memory(
-            each, f"an optimizer with {self.evaluations():,} evaluations of each problem"
-        )
+        evaluations, kept = self.evaluations(n), self.returned(n)
+        returned = 8 * kept * (2 * n + 4)
+        each = self.bytes_per_problem(n) + returned + objective_bytes * self.evaluations_at_once(n)
+        require_memory(each, f"an optimizer with {evaluations:,} evaluations of each problem")
         shards_at_once = 1
         if self.in_threads:
             shards_at_once = cores()
         size = max(1, min(problems, memory // (each * shards_at_once)))
         if guesses.device.type == "cpu":
-            size = min(size, max(1, _LOSSES_AT_ONCE // self.evaluations()))
+            size = min(size, max(1, _LOSSES_AT_ONCE // kept))
+            if kept < evaluations:
+                size = min(size, _SEARCHED_AT_ONCE)
         guesses = guesses.double().clamp(0.0, 1.0)
         ended = Event()
 
         def solved(first: int) -> Solution:
             last = min(first + size, problems)
             guesses_of_shard, origin = guesses[first:last], registry.origin(self)
-            checked = _CheckedLosses(objective.select(first, last), progress, n, origin, ended)
+            done: list[int] = []
+
+            def count(number: int) -> None:
+                done.append(number)
+                progress(number)
+
+            of_shard = objective.take(slice(first, last))
+            checked = _CheckedLosses(of_shard, count, n, origin, ended)
             tried, losses = self.solve(checked, guesses_of_shard, seed=seed)
             blocks = tried if isinstance(tried, tuple) else (tried,)
             self._check(blocks, losses, guesses_of_shard)
-            return _reduce(blocks, losses, guesses_of_shard, self.space_filling(), tolerance)
+            left = len(guesses_of_shard) * evaluations - sum(done)
+            if left > 0:  # a search may end early
+                progress(left)
+            filling, ends = self.space_filling(n), self.ends(n)
+            return _reduce(blocks, losses, guesses_of_shard, filling, ends, tolerance)
 
         starts = range(0, problems, size)
         try:
@@ -235,7 +289,7 @@ class Optimizer(Component):
 
     def _check(self, blocks: tuple[Tensor, ...], losses: Tensor, guesses: Tensor) -> None:
         problems, _, n = guesses.shape
-        expected = (problems, self.evaluations())
+        expected = (problems, self.returned(n))
         evaluations, shapes, dtypes = 0, set(), {losses.dtype}
         for block in blocks:
             evaluations += block.shape[1]
@@ -246,7 +300,7 @@ class Optimizer(Component):
             returned = ", ".join(str(tuple(block.shape)) for block in blocks)
             raise PluginError(
                 f"{registry.origin(self)}: solve must return candidates {(*expected, n)} and losses"
-                f" {expected} as evaluations() says, but returned {returned} and"
+                f" {expected} as returned() says, but returned {returned} and"
                 f" {tuple(losses.shape)}"
             )
         if dtypes != {torch.float64}:
@@ -266,6 +320,7 @@ def _reduce(
     losses: Tensor,
     guesses: Tensor,
     space_filling: int,
+    ends: int,
     tolerance: float,
 ) -> Solution:
     """Reduces the evaluations of a shard to its solution.
@@ -275,6 +330,7 @@ def _reduce(
         losses: of all of them, `(P, e)`.
         guesses: `(P, g, n)`.
         space_filling: how many first evaluations were chosen without looking at losses.
+        ends: how many of the last are ends of independent searches.
         tolerance: losses this close to the lowest are equal.
     """
     g = guesses.shape[1]
@@ -296,7 +352,20 @@ def _reduce(
     if space_filling <= g:
         first = 0  # all space-filling evaluations are guesses, so guesses count
     filling = _low_median_high(losses[:, first:space_filling], finite[:, first:space_filling])
-    return Solution(best, loss, filling, (~finite).sum(dim=1))
+    apart = _apart(losses[:, losses.shape[1] - ends :])
+    return Solution(best, loss, filling, (~finite).sum(dim=1), apart)
+
+
+def _apart(ends: Tensor) -> Tensor:
+    """Returns how far the second lowest of ends `(P, k)` is above the lowest, as a share of it.
+
+    NaN with fewer than two ends, or where one of the two is no number.
+    """
+    if ends.shape[1] < 2:
+        return ends.new_full((len(ends),), torch.nan)
+    lowest, second = ends.sort(dim=1).values[:, :2].unbind(1)
+    share = (second - lowest) / lowest.abs().clamp(min=TIE_ABSOLUTE)
+    return share.where(second.isfinite(), torch.nan)
 
 
 def _low_median_high(losses: Tensor, finite: Tensor) -> Tensor:
@@ -384,8 +453,11 @@ class _CheckedLosses:
             of_blocks.append(losses)
         return torch.cat(of_blocks, dim=1)
 
-    def select(self, first: int, last: int) -> CandidateLosses:
-        return replace(self, objective=self.objective.select(first, last))
+    def take(self, problems: slice | Tensor) -> CandidateLosses:
+        return replace(self, objective=self.objective.take(problems))
+
+    def rough(self) -> CandidateLosses:
+        return replace(self, objective=self.objective.rough())
 
 
 def check_room(evaluations: int, guesses: int, *, key: str) -> None:

@@ -42,14 +42,14 @@ class RandomSearch(Optimizer):
     trial: ClassVar[Mapping[str, Any]] = {"samples": 1024}
     in_threads = True
 
-    def evaluations(self) -> int:
+    def evaluations(self, n: int) -> int:
         return self.settings.samples
 
-    def evaluations_at_once(self) -> int:
+    def evaluations_at_once(self, n: int) -> int:
         return min(AT_ONCE, self.settings.samples)
 
     def bytes_per_problem(self, n: int) -> int:
-        return 8 * self.evaluations_at_once() * (n + 2)
+        return 8 * self.evaluations_at_once(n) * (n + 2)
 
     def solve(
         self, objective: CandidateLosses, guesses: Tensor, *, seed: int

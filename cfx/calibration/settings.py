@@ -20,6 +20,9 @@ INTERVAL_LEVEL = 0.9
 MIN_NARROWING = 0.3
 """A recording determines a parameter where its interval is narrower than a priori by this share."""
 
+APART = 0.01
+"""Share of the loss by which independent ends of a search differ where an optimum may be missed."""
+
 MAX_PARETO_K = 0.7
 """Pareto k of weighted samples above which an interval is not to be relied on (Vehtari et al. 2024,
 *Pareto smoothed importance sampling*)."""

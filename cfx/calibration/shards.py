@@ -76,6 +76,11 @@ class Solver:
         return self.segments(batch, pair, pair, pair + 1).accumulates
 
     @property
+    def brief(self) -> Solver:
+        """The solver of labels and pooled parameters: `Optimizer.brief`."""
+        return replace(self, optimizer=self.optimizer.brief())
+
+    @property
     def scope(self) -> dict[str, Any]:
         """Everything but the trajectories that results depend on, for keys of the cache."""
         model = self.stepper.model
@@ -118,7 +123,7 @@ class Solver:
                 prior = Prior.of(losses, guesses, squashed(default), self.prior)
                 searched = replace(losses, prior=prior)
         solution = self.optimizer.minimize(
-            searched.for_work(self.optimizer.evaluations()),
+            searched.for_work(self.optimizer.evaluations(len(self.space))),
             guesses,
             seed=self.seed,
             objective_bytes=searched.bytes_per_candidate,
@@ -132,12 +137,15 @@ class Solver:
             best = self.space.to_unit(parameters).double()
             settled = self._settled(searched, best, guesses[0, 0])
             parameters, loss = self.space.from_unit(settled), losses(settled[:, None])[:, 0]
-        return {
+        row = {
             "parameters": parameters.cpu().numpy(),
             "loss": loss.cpu().numpy(),
             "sensitivity": solution.sensitivity.cpu().numpy(),
             "diverged": solution.diverged.cpu().numpy(),
         }
+        if self.optimizer.ends(len(self.space)):
+            row["apart"] = solution.apart.cpu().numpy()
+        return row
 
     def _settled(
         self, losses: SegmentLosses | PooledLosses, best: Tensor, default: Tensor
@@ -151,11 +159,11 @@ class Solver:
         size = max(1, self.memory // (losses.bytes_per_candidate * len(_STEPS_TOWARDS_DEFAULT)))
         # Whether a kernel pays is asked for as much work as the search was, so that losses have
         # the bits that they had there.
-        same_losses = losses.for_work(self.optimizer.evaluations())
+        same_losses = losses.for_work(self.optimizer.evaluations(len(self.space)))
         settled = []
         for first in range(0, len(best), size):
             last = min(first + size, len(best))
-            shard = same_losses.select(first, last)
+            shard = same_losses.take(slice(first, last))
             settled.append(_towards(default, shard, best[first:last]))
         return torch.cat(settled)
 

@@ -394,6 +394,13 @@ class Fits(ResultTable):
         Column("test_rmse_speed", "m/s", "on the test part", required=False),
         Column("train_rmse_gap", "m", "on the part that was calibrated on", required=False),
         Column("test_rmse_gap", "m", "on the test part", required=False),
+        Column(
+            "ends_apart",
+            "1",
+            "by which share of the loss independent ends of the search of `fixed` differ; above"
+            " 0.01 the optimum may have been missed",
+            required=False,
+        ),
         Column("median_NAME", "as of the parameter", "its median a posteriori, of `fixed`"),
         Column("low_NAME", "as of the parameter", "the lower end of its 90 % interval"),
         Column("high_NAME", "as of the parameter", "the upper end"),

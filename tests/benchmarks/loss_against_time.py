@@ -86,7 +86,7 @@ def run(
     optimizer = cast("Optimizer", registry.create("optimizer", {"name": name, **options}))
     began = time.process_time()
     solution = optimizer.minimize(
-        losses.for_work(optimizer.evaluations()),
+        losses.for_work(optimizer.evaluations(guesses.shape[-1])),
         guesses,
         seed=0,
         objective_bytes=losses.bytes_per_candidate,

@@ -118,7 +118,7 @@ def test_labels_per_second(benchmark: Any, model: DrivingModel) -> None:
         # The plain loop warns of fits and climbs that did not converge: part of what is compared.
         warnings.simplefilter("ignore")
         plain = [
-            plain_loop(objective.select(i, i + 1), guesses[i], initial=10, iterations=30)
+            plain_loop(objective.take(slice(i, i + 1)), guesses[i], initial=10, iterations=30)
             for i in range(LOOPED)
         ]
     plain_seconds = (time.perf_counter() - began) / LOOPED

@@ -68,7 +68,7 @@ def test_population(benchmark: Any, model: DrivingModel) -> None:
     one_by_one = PooledLosses(eager, members, MEMORY)
     began = time.perf_counter()
     expected = torch.cat(
-        [one_by_one.select(k, k + 1)(candidates[k : k + 1]) for k in range(FOLDS + 1)]
+        [one_by_one.take(slice(k, k + 1))(candidates[k : k + 1]) for k in range(FOLDS + 1)]
     )
     seconds = time.perf_counter() - began
     torch.testing.assert_close(losses, expected, rtol=1e-6, atol=1e-9)

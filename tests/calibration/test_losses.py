@@ -42,7 +42,7 @@ def test_losses_are_the_objective_of_the_rollout(objective: Objective) -> None:
             parameters = model.space.from_unit(candidates[i, j])
             expected = loss_of(objective, model, batch, int(pair[i]), frames, parameters)
             torch.testing.assert_close(found[i, j], expected)
-    torch.testing.assert_close(losses.select(1, 2)(candidates[1:]), found[1:])
+    torch.testing.assert_close(losses.take(slice(1, 2))(candidates[1:]), found[1:])
 
 
 def loss_of(
@@ -90,7 +90,7 @@ def test_a_pooled_loss_is_the_mean_of_its_segments() -> None:
         first, second = (segments(asked[[k, k, k]]) for k in range(2))
         expected = torch.stack([first[:2].mean(0), second.mean(0)])
         torch.testing.assert_close(pooled(asked), expected)
-        torch.testing.assert_close(pooled.select(1, 2)(asked[1:]), expected[1:])
+        torch.testing.assert_close(pooled.take(slice(1, 2))(asked[1:]), expected[1:])
         # One candidate at a time gives the same.
         torch.testing.assert_close(PooledLosses(segments, members, memory=1)(asked), expected)
 

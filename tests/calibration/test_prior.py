@@ -62,7 +62,7 @@ def test_the_default_costs_nothing_and_distance_costs_more() -> None:
     torch.testing.assert_close(with_prior(near), plain(near))
     assert bool((with_prior(far) > plain(far)).all())
     both = torch.cat([near, far], 1)
-    torch.testing.assert_close(with_prior.select(1, 2)(both[1:]), with_prior(both)[1:])
+    torch.testing.assert_close(with_prior.take(slice(1, 2))(both[1:]), with_prior(both)[1:])
 
 
 def test_what_is_determined_is_found_and_what_is_not_stays() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -101,6 +102,10 @@ def calibration_tables(
                 rows[f"train_{name}"] = values.cpu().numpy()
                 if context.split < 1:  # else nothing was tested
                     rows[f"test_{name}"] = of_method[name].to_numpy(dtype=np.float64)
+            tested = [context.pairs[index] for index in chosen.tolist()]
+            apart = context.calibrator.apart(tested, last)
+            if method == "fixed" and not all(map(math.isnan, apart)):
+                rows["ends_apart"] = apart
             if method == "fixed" and settings.posterior != "none":
                 solver = context.calibrator.solver
                 method_of = posterior_method(settings.posterior)

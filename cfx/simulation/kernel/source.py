@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 
 from cfx.simulation.kernel.columns import memory_names
-from cfx.simulation.kernel.graph import INPUTS, StepProgram, parameter_names
+from cfx.simulation.kernel.graph import INPUTS, Assignment, StepProgram, parameter_names
 
 BLOCK = 32
 """Candidates of a shard."""
@@ -116,7 +116,9 @@ def write(
     lines = [head(dtype, BLOCK) + _ACCUMULATE]
     shift = _shift(program.memory)
     lines += _begin(varied, len(program.terms), len(program.memory), shift)
-    lines += _loop(program, varied, shift, summed=summed)
+    constant = _constant_in_time(program, varied)
+    lines += _before(constant, varied)
+    lines += _loop(program, varied, shift, constant, summed=summed)
     if summed:
         for k in range(len(program.terms)):
             target = f"sums[({k} * problems + i) * candidates + begin + j]"
@@ -182,7 +184,42 @@ def _begin(varied: Sequence[bool], terms: int, width: int, shift: int) -> list[s
     return lines
 
 
-def _loop(program: StepProgram, varied: Sequence[bool], shift: int, *, summed: bool) -> list[str]:
+def _constant_in_time(program: StepProgram, varied: Sequence[bool]) -> list[Assignment]:
+    """Returns the statements that depend on parameters alone, such as IDM's 2 sqrt(a b)."""
+    known = set(parameter_names(len(varied)))
+    found = []
+    for statement in program.statements:
+        names = [operand for operand in statement.operands if not operand.startswith("real(")]
+        if names and known.issuperset(names) and not statement.is_condition:
+            known.add(statement.name)
+            found.append(statement)
+    return found
+
+
+def _before(constant: Sequence[Assignment], varied: Sequence[bool]) -> list[str]:
+    """Returns what computes these statements once for each candidate, before time passes."""
+    if not constant:
+        return []
+    lines = [f"    real {statement.name}s[BLOCK];" for statement in constant]
+    lines.append("    for (long j = 0; j < BLOCK; ++j) {")
+    for k, name in enumerate(parameter_names(len(varied))):
+        if varied[k]:
+            lines.append(f"      const real {name} = {name}s[j];")
+    for statement in constant:
+        lines.append(f"      {statement.declaration}")
+        lines.append(f"      {statement.name}s[j] = {statement.name};")
+    lines.append("    }")
+    return lines
+
+
+def _loop(
+    program: StepProgram,
+    varied: Sequence[bool],
+    shift: int,
+    constant: Sequence[Assignment],
+    *,
+    summed: bool,
+) -> list[str]:
     """Returns the loop over time, with the loop over candidates inside."""
     lines = ["    for (long t = 0; t < ends[i]; ++t) {"]
     lines += _turned(len(program.memory), shift)
@@ -201,7 +238,10 @@ def _loop(program: StepProgram, varied: Sequence[bool], shift: int, *, summed: b
     for k, name in enumerate(names):
         lines.append(f"        const real {name} = M[{k}][j];")
     for statement in program.statements:
-        lines.append(f"        {statement.declaration}")
+        line = statement.declaration
+        if statement in constant:
+            line = f"const real {statement.name} = {statement.name}s[j];"
+        lines.append(f"        {line}")
     for k, term in enumerate(program.terms):
         lines.append(f"        const real added{k} = {term};")
     for array, value in zip(("next_x", "next_v", "next_a"), program.state, strict=True):

@@ -67,7 +67,7 @@ def test_a_budget_smaller_than_the_first_evaluations_is_kept(samples: int) -> No
     optimizer = CmaOptimizer(samples=samples, initial=8)
     problems = Problems(valley, random(2, 3))
     optimizer.minimize(problems, random(2, 1, 3), seed=0)
-    assert sum(asked.shape[1] for asked in problems.asked) == samples == optimizer.space_filling()
+    assert sum(asked.shape[1] for asked in problems.asked) == samples == optimizer.space_filling(3)
 
 
 def test_more_guesses_than_first_evaluations_is_told() -> None:

@@ -127,7 +127,7 @@ class Half(Small):
 
 
 class Overfilled(Small):
-    def space_filling(self) -> int:
+    def space_filling(self, n: int) -> int:
         return 61
 
 
@@ -180,11 +180,11 @@ BROKEN: dict[str, tuple[Optimizer, Any, str]] = {
     ),
     "numbering": (Numbering(), checks.shards_change_nothing, "never on the result"),
     "deaf": (Deaf(), checks.evaluates_exactly_what_it_says, "every guess is evaluated"),
-    "twice": (Twice(), checks.evaluates_exactly_what_it_says, "not one more"),
+    "twice": (Twice(), checks.evaluates_exactly_what_it_says, "is the budget of comparisons"),
     "overfilled": (
         Overfilled(),
         first.says_how_much_it_does_in_whole_numbers,
-        "measured over the first of them",
+        "measured over the first of what it",
     ),
     "frozen": (
         Frozen(),
@@ -211,7 +211,7 @@ def test_every_statement_has_an_optimizer_that_breaks_it() -> None:
 
 def test_a_miscount_is_reported() -> None:
     class Miscounting(Small):
-        def evaluations(self) -> int:
+        def evaluations(self, n: int) -> int:
             return 59
 
     found = dict(violations(Miscounting(), checks.CONTRACT.quick))

@@ -28,10 +28,10 @@ class HaltonSearch(Optimizer):
     schema = HaltonSearchSettings
     settings: HaltonSearchSettings
 
-    def evaluations(self) -> int:
+    def evaluations(self, n: int) -> int:
         return self.settings.samples
 
-    def evaluations_at_once(self) -> int:
+    def evaluations_at_once(self, n: int) -> int:
         return self.settings.samples
 
     def bytes_per_problem(self, n: int) -> int:

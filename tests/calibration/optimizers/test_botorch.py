@@ -19,7 +19,7 @@ def test_forty_evaluations_beat_four_thousand_random_ones(function: Function) ->
     searched = cfx.get("optimizer", "random")(samples=4096).minimize(problems, guesses, seed=0)
     forty = BotorchOptimizer(screening=0)
     modelled = forty.minimize(problems, guesses, seed=0)
-    assert forty.evaluations() == 40
+    assert forty.evaluations(2) == 40
     assert modelled.loss.mean() <= 1.02 * searched.loss.mean()
 
 

@@ -20,7 +20,7 @@ class Listed(Optimizer):
         candidates = torch.cat([guesses, self.points.expand(len(guesses), -1, -1)], dim=1)
         return candidates, objective(candidates)
 
-    def evaluations(self) -> int:
+    def evaluations(self, n: int) -> int:
         return 4
 
     def bytes_per_problem(self, n: int) -> int:
@@ -36,7 +36,7 @@ class Undefined(Listed):
 
 
 class Miscounting(Listed):
-    def evaluations(self) -> int:
+    def evaluations(self, n: int) -> int:
         return 5
 
 

@@ -66,18 +66,18 @@ class CmaOptimizer(Optimizer):
     settings: CmaSettings
     trial: ClassVar[Mapping[str, Any]] = {"samples": 90, "initial": 8}
 
-    def evaluations(self) -> int:
+    def evaluations(self, n: int) -> int:
         return self.settings.samples
 
-    def evaluations_at_once(self) -> int:
+    def evaluations_at_once(self, n: int) -> int:
         return max(self._initial, self.settings.population or _MOST_PER_GENERATION)
 
-    def space_filling(self) -> int:
+    def space_filling(self, n: int) -> int:
         return self._initial
 
     def bytes_per_problem(self, n: int) -> int:
         # An evolution strategy took 30 kB at 9 parameters; it holds about ten (n, n) matrices.
-        return 50_000 + 8 * (12 * n * n + 3 * self.evaluations_at_once() * (n + 2))
+        return 50_000 + 8 * (12 * n * n + 3 * self.evaluations_at_once(n) * (n + 2))
 
     def solve(
         self, objective: CandidateLosses, guesses: Tensor, *, seed: int

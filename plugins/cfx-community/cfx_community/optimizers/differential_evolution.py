@@ -103,13 +103,13 @@ class DifferentialEvolution(Optimizer):
     settings: DifferentialEvolutionSettings
     trial: ClassVar[Mapping[str, Any]] = {"population": 12, "generations": 11}
 
-    def evaluations(self) -> int:
+    def evaluations(self, n: int) -> int:
         return self.settings.population * (self.settings.generations + 1)
 
-    def evaluations_at_once(self) -> int:
+    def evaluations_at_once(self, n: int) -> int:
         return self.settings.population
 
-    def space_filling(self) -> int:
+    def space_filling(self, n: int) -> int:
         return self.settings.population
 
     def bytes_per_problem(self, n: int) -> int:

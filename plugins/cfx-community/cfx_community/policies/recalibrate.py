@@ -153,7 +153,7 @@ class RecalibrateNetwork(EstimatorNetwork):
         unit = prior.double().sigmoid()[:, None]
         wanted = replace(losses, prior=Prior.of(losses, unit, prior[:, None], self._weight))
         solution = self._optimizer.minimize(
-            wanted.for_work(self._optimizer.evaluations()),
+            wanted.for_work(self._optimizer.evaluations(unit.shape[-1])),
             unit,
             seed=_SEED,
             objective_bytes=losses.bytes_per_candidate,
