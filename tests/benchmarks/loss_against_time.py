@@ -35,6 +35,7 @@ _TIMES_S = (0.1, 0.3, 1.0, 3.0, 10.0)
 _BUDGETS: dict[str, tuple[dict[str, Any], ...]] = {
     "random": tuple({"samples": 2**k} for k in range(6, 21)),
     "gradient": tuple({"samples": 2**k} for k in range(6, 20)),
+    "shade": tuple({"samples": 2**k} for k in range(12, 20)),
     "botorch": (
         {"screening": 256, "iterations": 0},
         {"iterations": 0},
