@@ -349,3 +349,15 @@ def test_what_is_no_recording_is_said(given: Any) -> None:
         cfx.calibrate(given, "idm")
     with pytest.raises(ConfigError, match=r"give a (path|file)"):
         cfx.evaluate("cfx://i80-idm", given)
+
+
+def test_a_fit_says_whether_it_is_the_optimum(pairs: cfx.Pairs, fit: cfx.Fit) -> None:
+    found = cfx.calibrate(pairs, "krauss")
+    assert bool((found.ends_apart < 0.01).all())
+    assert found.losses.groupby("method")["ends_apart"].count().to_dict() == {
+        "default": 0,
+        "fixed": 3,
+        "population": 0,
+    }
+    assert fit.ends_apart.isna().all()
+    assert "ends_apart" not in fit.losses

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import copy
+import math
 from collections.abc import Generator, Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -361,3 +362,32 @@ def test_a_cluster_shares_drivers_among_its_workers_and_changes_no_bit(
     expected = here.population(pairs, batch, last, members)
     assert torch.equal(there.population(pairs, batch, last, members), expected)
     assert len(elsewhere.shards) == 1, "what is simulated for one group serves all"
+
+
+class Torn(RandomSearch):
+    """Says that its last two points are ends of independent searches."""
+
+    def ends(self, n: int) -> int:
+        return 2
+
+
+def test_drivers_whose_ends_differ_are_counted_and_named(
+    caplog: pytest.LogCaptureFixture, tmp_path: Path
+) -> None:
+    pairs = wavy_pairs(Krauss(), TRUE)
+    batch, last = PairBatch.of(pairs), torch.full((len(pairs),), 200)
+    settled, torn = calibrator(RandomSearch(samples=64)), calibrator(Torn(samples=64), tmp_path)
+    settled.fixed(pairs, batch, last)
+    assert all(math.isnan(share) for share in settled.apart(pairs, last))
+    assert not caplog.messages
+    torn.fixed(pairs, batch, last)
+    apart = torn.apart(pairs, last)
+    assert min(apart) > 0.01
+    assert [message[:46] for message in caplog.messages] == [
+        "The optimum of 3 of 3 pairs may have been miss"
+    ]
+    assert all(pair.pair_id in caplog.text for pair in pairs)
+    # Another process that finds the entries says the same.
+    again = calibrator(Torn(samples=64), tmp_path)
+    again.fixed(pairs, batch, last)
+    assert again.apart(pairs, last) == apart

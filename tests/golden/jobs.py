@@ -71,6 +71,13 @@ JOBS: dict[str, tuple[str, ...]] = {
         "objective=gap_rmse",
         "policy=fixed",
     ),
+    "shade": (
+        "optimizer=shade",
+        "optimizer.samples=30000",
+        "simulator.compile=always",
+        "model=idm",
+        "policy=fixed",
+    ),
     "kernel": ("optimizer.samples=4096", "policy=default"),
     "compiled": ("simulator.compile=always", "policy=default"),
     "rollout": (*_ACROSS, *_ROLLOUT, "optimizer=gradient", "protocol.histories=[0,5]"),
