@@ -264,7 +264,7 @@ def chosen_pairs(job: Result) -> tuple[pair_lines.RankedPair, ...]:
     if job.purpose is Purpose.CALIBRATION:
         gains = -table[f"rmse_speed/{job.judged}"].to_numpy(dtype=float)
     else:
-        gains = table["improvement/fixed"].to_numpy(dtype=float)
+        gains = table["improvement/driver_specific"].to_numpy(dtype=float)
     return pair_lines.rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
@@ -277,7 +277,7 @@ def _title(job: Result, pair: pair_lines.RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
     if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
         improvement = wording.percent(pair.improvement, 1)
-        title += f": {improvement} over {wording.short_label('fixed')} calibration"
+        title += f": {improvement} over {wording.short_label('driver_specific')} calibration"
     return title
 
 
