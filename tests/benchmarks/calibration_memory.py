@@ -1,6 +1,6 @@
 """Memory and CPU time of one calibration of I-80's drivers, from 4,096 candidates each, on one core.
 
-`python -m tests.benchmarks.calibration_memory fixed --model krauss --copies 4`: `driver_specific`,
+`python -m tests.benchmarks.calibration_memory driver_specific --model krauss --copies 4`: `driver_specific`,
 `pooled` (the pooled sets of six networks) or `labels`; `--copies` makes more drivers of the 229
 that `../shared/data` has.
 """

@@ -140,7 +140,7 @@ def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
         places = spread.places(spread.values)
         named = {
             method: wording.method_label(method) if row == 0 else ""
-            for method in ("fixed", "default")
+            for method in ("driver_specific", "default")
         }
         aside = row + _WIDTH * spread_offsets(len(places))
         dots: dict[str, Any] = {

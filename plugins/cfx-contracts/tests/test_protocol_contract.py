@@ -82,7 +82,7 @@ class _Whole:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._calibrator, name)
 
-    def fixed(self, pairs: Any, batch: Any, last: Any) -> Any:
+    def driver_specific(self, pairs: Any, batch: Any, last: Any) -> Any:
         return self._calibrator.driver_specific(pairs, batch, batch.lengths - 1)
 
 

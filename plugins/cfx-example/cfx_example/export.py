@@ -28,7 +28,7 @@ class DriverJson(ExportFormat):
         fixed = fixed.dropna(axis="columns", how="all").dropna()
         if fixed.empty:
             raise DataError(
-                f"{folder}/pairs.csv holds no driver-specific parameters (method fixed); give a"
+                f"{folder}/pairs.csv holds no driver-specific parameters; give a"
                 " job that calibrated some"
             )
         drivers = fixed.rename(columns=lambda name: name.removeprefix(PREFIX)).to_dict("index")

@@ -30,14 +30,14 @@ def test_cfx_finds_it():
 
 
 def test_it_writes_what_was_calibrated_to_each_driver(tmp_path):
-    (said,) = DriverJson().write(job(tmp_path, ["fixed", "default"]), None)
+    (said,) = DriverJson().write(job(tmp_path, ["driver_specific", "default"]), None)
     assert said == f"parameters of 1 drivers: {tmp_path / FILE}"
     assert json.loads((tmp_path / FILE).read_text()) == {"7": {"tau": 1.5}}
 
 
 def test_it_writes_where_the_user_says(tmp_path):
     path = tmp_path / "other" / "parameters.json"
-    DriverJson().write(job(tmp_path, ["fixed", "default"]), path)
+    DriverJson().write(job(tmp_path, ["driver_specific", "default"]), path)
     assert path.is_file()
 
 

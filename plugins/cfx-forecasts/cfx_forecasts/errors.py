@@ -25,7 +25,7 @@ FORECAST_METHODS = (
     "default",
     "pooled",
     "pooled_residual",
-    "fixed",
+    "driver_specific",
     "driver_specific_residual",
     "policy",
 )

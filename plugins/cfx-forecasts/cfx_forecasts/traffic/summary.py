@@ -13,7 +13,7 @@ from cfx.plugin import RECORDED
 TRAFFIC_METHODS = (
     "pooled",
     "pooled_ar",
-    "fixed",
+    "driver_specific",
     "driver_specific_ar",
     "policy",
     "policy_sampled",

@@ -50,11 +50,11 @@ _SITE_COLUMNS = (
     "rmse_speed_pooled",
     "rmse_speed_policy",
     "over_driver_specific",
-    "over_fixed_low",
-    "over_fixed_high",
+    "over_driver_specific_low",
+    "over_driver_specific_high",
     "over_pooled",
-    "over_population_low",
-    "over_population_high",
+    "over_pooled_low",
+    "over_pooled_high",
 )
 
 

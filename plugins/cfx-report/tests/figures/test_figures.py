@@ -69,7 +69,11 @@ def everything() -> Result:
         [("test", "A", "all"), ("test", "A", "acc"), ("full_trajectory", "A", "all")],
         columns=["scope", "site", "driver_type"],
     )
-    gains = {"over_driver_specific": 0.1, "over_fixed_low": -0.1, "over_fixed_high": 0.2}
+    gains = {
+        "over_driver_specific": 0.1,
+        "over_driver_specific_low": -0.1,
+        "over_driver_specific_high": 0.2,
+    }
     tables = {
         "sites": sites.assign(**gains),
         "platoon": make_platoon({"policy": 2}).table,

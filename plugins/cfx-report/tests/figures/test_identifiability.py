@@ -83,7 +83,7 @@ def test_a_slice_without_a_finite_loss_is_left_out_or_infinite() -> None:
 
 def test_fits_have_the_pairs_that_are_defined_on_both_parts() -> None:
     fits = fits_of(FITS)
-    assert list(fits) == ["fixed", "default"]
+    assert list(fits) == ["driver_specific", "default"]
     assert fits["driver_specific"]["pair_id"].tolist() == ["a"]
     assert fits["default"]["train_rmse_speed"].tolist() == [0.9, 0.8]
 
