@@ -165,6 +165,7 @@ class JobComponents:
         plugins = distributions(config.model_dump())
         registry.chosen("table", config.tables, plugins)
         registry.chosen("figure", config.figures, plugins)
+        objective = cast(Objective, registry.create("objective", config.objective))
         demo = None
         if config.demo is not None:
             demo = cast(Demo, registry.create("demo", config.demo))
@@ -173,11 +174,11 @@ class JobComponents:
             model=model,
             simulator=simulator,
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
-            objective=cast(Objective, registry.create("objective", config.objective)),
+            objective=objective,
             policy=policy,
             learner=learner,
             protocol=protocol,
-            metrics=MetricSet.of(config.metrics),
+            metrics=MetricSet.of(config.metrics).judged_by(objective),
             engine=cast(Engine, registry.create("engine", config.engine)),
             demo=demo,
         )

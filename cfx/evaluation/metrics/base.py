@@ -10,7 +10,7 @@ import logging
 import re
 from abc import abstractmethod
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from cfx.core import registry
@@ -21,6 +21,7 @@ from cfx.errors import PluginError
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from cfx.calibration.objectives import Objective
     from cfx.core.parameters import ParameterSpace
 
 log = logging.getLogger(__name__)
@@ -193,11 +194,27 @@ def column_of(metric: str, scope: str = "test") -> str:
     return f"{scope}_{metric}"
 
 
+RMSE_SPEED = MetricInfo(
+    name="rmse_speed",
+    unit="m/s",
+    direction="lower",
+    summary="mean",
+    heading="RMSE of speed",
+    meaning="root mean square difference between the simulated and the measured speed",
+    scopes=SCOPES,
+    headline=True,
+    distribution=OWN,
+)
+"""The error by which a job is judged whose objective is not known."""
+
+OBJECTIVE = "objective"
+"""The name of a metric that is the job's objective itself."""
+
 ALWAYS = ("rmse_speed", "rmse_gap", "collisions")
 """Measured in every job: the comparison of methods, the figures and the reports rest on them."""
 
 _TAKEN = re.compile(
-    r"(steady|full_trajectory|real|improvement|parameter|platoon|history|labels)(_.*)?"
+    r"(steady|full_trajectory|real|improvement|parameter|platoon|history|labels|objective)(_.*)?"
     r"|pair_id|recording|(leader|follower)_id|driver|cluster|style_score|fold|method|frames"
     r"|(train|validation)_loss|all"
 )
@@ -212,9 +229,15 @@ class MeasuredMetric:
     metric: Metric
     distribution: str
 
-    def info(self, measured: Collection[str]) -> MetricInfo:
-        """Returns what is to be known of it; `measured` are the scopes that were."""
+    def info(self, measured: Collection[str], *, judges: bool = False) -> MetricInfo:
+        """Returns what is to be known of it.
+
+        Args:
+            measured: the scopes that were.
+            judges: the job is judged by it: it is shown everywhere, of each scope.
+        """
         metric = self.metric
+        scopes = SCOPES if judges else metric.scopes
         return MetricInfo(
             name=self.name,
             unit=metric.unit,
@@ -222,8 +245,8 @@ class MeasuredMetric:
             summary=metric.summary,
             heading=metric.heading,
             meaning=metric.meaning,
-            scopes=tuple(scope for scope in metric.scopes if scope in measured),
-            headline=metric.headline,
+            scopes=tuple(scope for scope in scopes if scope in measured),
+            headline=metric.headline or judges,
             distribution=self.distribution,
         )
 
@@ -244,10 +267,27 @@ class MetricSet:
     Attributes:
         metrics: what is measured.
         left_out: what is installed and broken.
+        judge: name of the error by which methods, and jobs, are compared.
     """
 
     metrics: tuple[MeasuredMetric, ...]
     left_out: tuple[LeftOut, ...] = field(default=())
+    judge: str = RMSE_SPEED.name
+
+    def judged_by(self, objective: Objective) -> MetricSet:
+        """Returns the metrics of a job with an objective, the error that it minimises first."""
+        from cfx.evaluation.metrics.objective import ObjectiveMetric
+
+        judge = objective.metric or OBJECTIVE
+        metrics = {one.name: one for one in self.metrics}
+        if objective.metric and judge not in metrics:
+            metrics[judge] = _made(registry.entry("metric", judge))
+        elif not objective.metric:
+            name = registry.name_of(objective)
+            brought_by = OWN if registry.is_own(objective) else registry.origin(objective)
+            metrics[judge] = MeasuredMetric(judge, ObjectiveMetric(name, objective), brought_by)
+        first = metrics.pop(judge)
+        return replace(self, metrics=(first, *_ordered(list(metrics.values()))), judge=judge)
 
     @classmethod
     def of(cls, chosen: str | Sequence[str] = ALL_OWN) -> MetricSet:
