@@ -17,10 +17,19 @@ __all__ = [
 RESULT = "result"
 """The tag that says it in words."""
 
+ERROR = "error"
+"""The tag with the name of the metric that a job is judged by, with its unit."""
+
+DEFAULT_ERROR = "rmse_speed_mps"
+"""What `ERROR` says of a job whose objective is not known."""
+
+TESTED = "tested on"
+"""The tag that two jobs share that were tested on the same frames of the same pairs."""
+
 PERCENT = "improvement_percent"
 """What charts begin with. No metric of the headline has a group: MLflow puts such first."""
 
-_ERRORS = {"rmse_speed": ("RMSE of speed", "m/s"), "rmse_gap": ("RMSE of the gap", "m")}
+_ERRORS = {"rmse_speed": ("RMSE of speed", "m/s"), "rmse_gap": ("RMSE of gap", "m")}
 """Heading and unit of the errors that a job tells beside the one that it is judged by."""
 
 _COUNTED = ("collisions", "hard_braking")
@@ -103,12 +112,16 @@ FEW_DRIVERS = 10
 """Of fewer drivers than these an improvement says little about others."""
 
 
-def doubts(metrics: Mapping[str, float], compared: Comparison) -> list[str]:
-    """Returns what is to be known beside an improvement, as parts of a sentence."""
-    geometric = metrics.get(f"{compared.key}/geometric", math.nan)
-    note = summaries_disagree(geometric, metrics.get(f"{compared.key}/ratio_of_means", math.nan))
+def doubts(statistics: Mapping[str, float]) -> list[str]:
+    """Returns what is to be known beside an improvement, as parts of a sentence.
+
+    Args:
+        statistics: of the improvement, by name: those that are known.
+    """
+    ratio_of_means = statistics.get("ratio_of_means", math.nan)
+    note = summaries_disagree(statistics.get("geometric", math.nan), ratio_of_means)
     parts = [note] if note else []
-    drivers = metrics.get(f"{compared.key}/drivers", math.nan)
+    drivers = statistics.get("drivers", math.nan)
     if drivers < FEW_DRIVERS:
         parts.append("one driver" if drivers == 1 else f"{drivers:.0f} drivers")
     return parts
@@ -166,13 +179,13 @@ def headline(
                     values[with_unit(f"{name}_{method}", unit)] = round(error, 3)
         words.append(_error_said(f"{heading}", f" {unit}".rstrip(), measured, baseline))
     for name in _COUNTED:
-        value = metrics.get(key_of(name, _judged_method(metrics, judge.name)), math.nan)
+        value = metrics.get(key_of(name, judged_method(metrics, judge.name)), math.nan)
         if math.isfinite(value):
             values[name] = round(value, 3)
     return values, "; ".join(words)
 
 
-def _judged_method(metrics: Mapping[str, float], judge: str) -> str:
+def judged_method(metrics: Mapping[str, float], judge: str) -> str:
     """Returns the method that a job is judged by, "" if none was measured."""
     for method in ("policy", *_CONSTANT):
         if math.isfinite(metrics.get(key_of(judge, method), math.nan)):
@@ -222,4 +235,8 @@ def _improvement(
     text += f" over {_CONSTANT[compared.baseline]}"
     if compared.scope != "test":
         text += " on full trajectories"
-    return ", ".join([text, *doubts(metrics, compared)])
+    known = {}
+    for name in ("geometric", "ratio_of_means", "drivers"):
+        if f"{compared.key}/{name}" in metrics:
+            known[name] = metrics[f"{compared.key}/{name}"]
+    return ", ".join([text, *doubts(known)])

@@ -260,6 +260,14 @@ class Evaluation:
         return replace(self, about=about, values=values, platoon=platoon)
 
     @property
+    def judge_info(self) -> MetricInfo:
+        """The metric by which methods are compared."""
+        for metric in self.measured:
+            if metric.name == self.judge:
+                return metric
+        return RMSE_SPEED
+
+    @property
     def _policy_repeats(self) -> bool:
         """Whether the policy has the errors of another method, for every pair."""
         speed = values_of(self.values, "rmse_speed", "test")

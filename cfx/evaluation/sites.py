@@ -34,8 +34,8 @@ def site_table(pairs: PairSet, evaluation: Evaluation) -> pd.DataFrame | None:
         where a site has several): scope, site, driver_type, pairs, drivers, for each method
         `rmse_speed_METHOD` (m/s) and `rmse_gap_METHOD` (m), means over pairs, and the error by
         which the job is judged where it is another; and for each baseline the policy's geometric
-        improvement of that error `over_BASELINE`, its median over
-        drivers `over_BASELINE_median`, and its 95 % interval over drivers, `over_BASELINE_low` and
+        improvement of that error `over_BASELINE`, its median over drivers
+        `over_BASELINE_median`, and its 95 % interval over drivers, `over_BASELINE_low` and
         `over_BASELINE_high`. The site `all` is the mean over sites: see `geometric_over_sites`.
     """
     labels = _labels(pairs, evaluation)

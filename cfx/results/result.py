@@ -406,15 +406,18 @@ class Result:
         """Statistics of the policy's improvement on the test part, by baseline."""
         return {baseline: self.statistics(baseline) for baseline in self.baselines()}
 
-    @property
-    def errors(self) -> pd.DataFrame:
-        """A row per pair, by the method that the job is judged by: `pair_id`, `driver`, `frames`.
+    def errors_by(self, metric: str) -> pd.DataFrame:
+        """Returns a row per pair, by the method that the job is judged by.
 
-        `error` is that of the metric `judge` on the test part, in its unit.
+        Args:
+            metric: name of the error, such as that of `judge`.
+
+        Returns:
+            `pair_id`, `driver`, `frames` that count, and `error` on the test part, in its unit.
         """
         rows = self.pairs[self.pairs["method"] == self.judged]
-        columns = ["pair_id", "driver", "frames", self.judge.name]
-        return rows[columns].rename(columns={self.judge.name: "error"})
+        columns = ["pair_id", "driver", "frames", metric]
+        return rows[columns].rename(columns={metric: "error"})
 
     @cached_property
     def by_pair(self) -> pd.DataFrame:

@@ -416,7 +416,7 @@ def description(
         "pairs": len(pairs),
         "protocol": dict(delivered.notes),
         "dropped": dropped,
-        "objective": {"name": config.objective["name"], "unit": components.objective.unit},
+        "objective": {**config.objective, "unit": components.objective.unit},
         "cfx": version(),
         "commit": commit(Path.cwd()),
     }

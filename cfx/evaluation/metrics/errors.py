@@ -53,7 +53,7 @@ class RmseGap(ErrorMetric):
     """Root mean square error of the gap: sqrt(sum e^2 / K')."""
 
     unit = "m"
-    heading = "RMSE of the gap"
+    heading = "RMSE of gap"
     meaning = (
         "root mean square difference between the simulated and the measured gap, bumper to bumper"
     )
@@ -83,7 +83,7 @@ class MaeGap(ErrorMetric):
     """Mean absolute error of the gap: sum |e| / K'."""
 
     unit = "m"
-    heading = "MAE of the gap"
+    heading = "MAE of gap"
     meaning = "mean absolute difference between the simulated and the measured gap"
     order = 12
 
@@ -108,7 +108,7 @@ class NrmseGap(ErrorMetric):
     """Normalised RMSE of the gap (Punzo et al. 2021): RMSE / sqrt(sum s^2 / K')."""
 
     unit = ""
-    heading = "NRMSE of the gap"
+    heading = "NRMSE of gap"
     meaning = "RMSE of the gap over the root mean square of the measured gap"
     order = 14
 
