@@ -36,6 +36,7 @@ from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.errors import ConfigError, PluginError
 from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.base import MetricSet
+from cfx.evaluation.metrics.objective import judged_by
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.sites import site_table
@@ -178,7 +179,7 @@ class JobComponents:
             policy=policy,
             learner=learner,
             protocol=protocol,
-            metrics=MetricSet.of(config.metrics).judged_by(objective),
+            metrics=judged_by(MetricSet.of(config.metrics), objective),
             engine=cast(Engine, registry.create("engine", config.engine)),
             demo=demo,
         )

@@ -10,7 +10,7 @@ import logging
 import re
 from abc import abstractmethod
 from collections.abc import Collection, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 
 from cfx.core import registry
@@ -21,7 +21,6 @@ from cfx.errors import PluginError
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from cfx.calibration.objectives import Objective
     from cfx.core.parameters import ParameterSpace
 
 log = logging.getLogger(__name__)
@@ -274,21 +273,6 @@ class MetricSet:
     left_out: tuple[LeftOut, ...] = field(default=())
     judge: str = RMSE_SPEED.name
 
-    def judged_by(self, objective: Objective) -> MetricSet:
-        """Returns the metrics of a job with an objective, the error that it minimises first."""
-        from cfx.evaluation.metrics.objective import ObjectiveMetric
-
-        judge = objective.metric or OBJECTIVE
-        metrics = {one.name: one for one in self.metrics}
-        if objective.metric and judge not in metrics:
-            metrics[judge] = _made(registry.entry("metric", judge))
-        elif not objective.metric:
-            name = registry.name_of(objective)
-            brought_by = OWN if registry.is_own(objective) else registry.origin(objective)
-            metrics[judge] = MeasuredMetric(judge, ObjectiveMetric(name, objective), brought_by)
-        first = metrics.pop(judge)
-        return replace(self, metrics=(first, *_ordered(list(metrics.values()))), judge=judge)
-
     @classmethod
     def of(cls, chosen: str | Sequence[str] = ALL_OWN) -> MetricSet:
         """Makes the metrics that are chosen, and those that every job measures.
@@ -302,18 +286,18 @@ class MetricSet:
         found, left_out = [], []
         for entry in entries_of(chosen):
             try:
-                found.append(_made(entry))
+                found.append(made(entry))
             except PluginError as error:
                 if chosen != "all" or entry.distribution == OWN:
                     raise
                 left_out.append(leave_out(entry.name, entry.distribution, str(error)))
-        return cls(_ordered(found), tuple(left_out))
+        return cls(in_order(found), tuple(left_out))
 
     @classmethod
     def own(cls) -> MetricSet:
         """Makes cfx's own metrics."""
         entries = registry.entries("metric")
-        return cls(_ordered([_made(one) for one in entries if one.distribution == OWN]))
+        return cls(in_order([made(one) for one in entries if one.distribution == OWN]))
 
 
 def entries_of(chosen: str | Sequence[str] = ALL_OWN) -> tuple[registry.Entry, ...]:
@@ -341,7 +325,12 @@ def leave_out(name: str, distribution: str, reason: str) -> LeftOut:
     return LeftOut(name, distribution, reason)
 
 
-def _made(entry: registry.Entry) -> MeasuredMetric:
+def made(entry: registry.Entry) -> MeasuredMetric:
+    """Makes the metric of an entry.
+
+    Raises:
+        PluginError: its name stands for something else, or it is broken.
+    """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", entry.name) or _TAKEN.fullmatch(entry.name):
         raise PluginError(
             f"{entry}: a metric cannot be called '{entry.name}', which stands for something else in"
@@ -351,5 +340,6 @@ def _made(entry: registry.Entry) -> MeasuredMetric:
     return MeasuredMetric(entry.name, metric, entry.distribution)
 
 
-def _ordered(metrics: Sequence[MeasuredMetric]) -> tuple[MeasuredMetric, ...]:
+def in_order(metrics: Sequence[MeasuredMetric]) -> tuple[MeasuredMetric, ...]:
+    """Returns metrics in the order in which they are shown."""
     return tuple(sorted(metrics, key=lambda one: (one.metric.order, one.name)))
