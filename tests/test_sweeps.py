@@ -31,10 +31,12 @@ JOB = """
     from dataclasses import dataclass
     from pathlib import Path
     from cfx.errors import DataError
+    from cfx.evaluation.metrics.base import RMSE_SPEED
 
     @dataclass
     class Result:
         metrics: dict
+        judge = RMSE_SPEED
 
     def run_job(config, folder):
         with Path("ran").open("a") as file:
@@ -52,12 +54,12 @@ JOB = """
             Path(f"waits-{config.seed}").touch()
             time.sleep(0.02)
         metrics = {f"rmse_speed/{method}": value + config.seed for method, value in
-                   (("default", 1.0), ("fixed", 0.5), ("policy", 0.25))}
-        metrics |= {"rmse_improvement/geometric": 0.5, "rmse_improvement/ci95_low": 0.25,
-                    "rmse_improvement/ci95_high": None}
+                   (("default", 1.0), ("driver_specific", 0.5), ("policy", 0.25))}
+        metrics |= {"improvement/rmse_speed/driver_specific/geometric": 0.5, "improvement/rmse_speed/driver_specific/ci95_low": 0.25,
+                    "improvement/rmse_speed/driver_specific/ci95_high": None}
         if config.model["name"] == "w99":
             for name in ("mean", "ci95_low", "ci95_high"):
-                metrics[f"rmse_improvement/population/{name}"] = 0.125
+                metrics[f"improvement/rmse_speed/pooled/{name}"] = 0.125
         (folder / "metrics.json").write_text(json.dumps(metrics))
         (folder / "told").write_text(f"{config.tracking.sweep} {os.environ.get('OMP_NUM_THREADS')}")
         return Result(metrics)
@@ -330,15 +332,21 @@ def test_the_summary_compares_jobs_by_what_differs(run: Run, capsys) -> None:
         ("2", "w99", "failed"),
     ]
     assert "split" not in table[0]
-    assert [row["improvement_over"] for row in table] == ["fixed", "fixed", "", ""]
+    assert [row["improvement_over"] for row in table] == [
+        "driver_specific",
+        "driver_specific",
+        "",
+        "",
+    ]
     assert [row["improvement_geometric"] for row in table] == ["0.5", "0.5", "", ""]
-    assert [row["improvement_ci95_high"] for row in table] == ["", "", "", ""]
-    assert [row["rmse_speed_policy"] for row in table] == ["0.25", "0.25", "", ""]
+    assert "improvement_ci95_high" not in table[0], "no job has it"
+    assert [row["method"] for row in table] == ["policy", "policy", "", ""]
+    assert [row["error_rmse_speed"] for row in table] == ["0.25", "0.25", "", ""]
     assert table[2]["message"] == "drive 2 is broken"
     assert {row["folder"] for row in table} == {path.name for path in jobs(folder)}
     printed = capsys.readouterr().out
-    assert "improvement over driver-specific" in printed
-    assert "+50.0%" in printed
+    assert "over driver-specific" in printed
+    assert "+50.0 %" in printed
     assert f"python -m cfx report {folder}" in printed
 
 

@@ -159,7 +159,7 @@ class Calibrator:
             return self.solver.objective.tie_tolerance
         return settings.tie_tolerance
 
-    def fixed(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> Tensor:
+    def driver_specific(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> Tensor:
         """Finds one parameter set per pair: the driver-specific parameters.
 
         Args:
@@ -174,7 +174,7 @@ class Calibrator:
         requested_device, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         last = last.to(device)
-        keys = self._keys_of_fixed(pairs, last)
+        keys = self._keys_of_own(pairs, last)
         compiled = self._has_kernel(batch)
 
         def shard(chosen: Tensor, claim: Tensor) -> SegmentShard:
@@ -213,21 +213,24 @@ class Calibrator:
     def apart(self, pairs: Iterable[Pair], last: Tensor) -> list[float]:
         """Returns how far the ends of the search of each pair's parameters were apart.
 
-        See `Solution.apart`. NaN where the optimizer has no such ends, or `fixed` was not asked.
+        See `Solution.apart`. NaN where the optimizer has no such ends, or `driver_specific` was not
+        asked.
 
         Args:
             pairs: P pairs.
-            last: `(P,)`, as in `fixed`.
+            last: `(P,)`, as in `driver_specific`.
         """
-        return [self._apart.get(key, math.nan) for key in self._keys_of_fixed(pairs, last)]
+        return [self._apart.get(key, math.nan) for key in self._keys_of_own(pairs, last)]
 
-    def _keys_of_fixed(self, pairs: Iterable[Pair], last: Tensor) -> list[str]:
+    def _keys_of_own(self, pairs: Iterable[Pair], last: Tensor) -> list[str]:
         keys = []
         for pair, end in zip(pairs, last.tolist(), strict=True):
-            keys.append(self._key("fixed", pair.fingerprint, frames=end, **self._prior_key))
+            keys.append(
+                self._key("driver_specific", pair.fingerprint, frames=end, **self._prior_key)
+            )
         return keys
 
-    def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
+    def pooled(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
         """Finds one parameter set for each of K groups of pairs: the pooled parameters.
 
         Their loss is the mean of their pairs' losses: see `PooledLosses`.
@@ -247,7 +250,7 @@ class Calibrator:
         keys = []
         for row in members:
             group = _group_key(pairs, last, row)
-            keys.append(self._key("population", "", pairs=group, **self._prior_key))
+            keys.append(self._key("pooled", "", pairs=group, **self._prior_key))
 
         compiled, brief = self._has_kernel(batch), self.solver.brief
         code = content_key(brief.scope)
@@ -286,7 +289,7 @@ class Calibrator:
         for number, (pair, count, row) in enumerate(rows):
             for first in range(0, count, _WINDOWS_OF_ENTRY):
                 size = min(_WINDOWS_OF_ENTRY, count - first)
-                which = {"first": first, "windows": size, "fixed": row}
+                which = {"first": first, "windows": size, "driver_specific": row}
                 keys.append(self._key("labels", pair.fingerprint, **which, **description))
                 owner.append(number)
                 begin.append(first)

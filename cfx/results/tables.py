@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 from rich.console import RenderableType
 from rich.markup import escape
@@ -26,9 +27,12 @@ from cfx.calibration.settings import (
 )
 from cfx.core.parameters import Parameter
 from cfx.data.style import INDICATORS, style_distances, styles_by_site
+from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.sites import ALL_SITES, BASELINES
+from cfx.evaluation.statistics import improvement_statistics
 from cfx.evaluation.tables import scope_label
+from cfx.figures.wording import short_label
 from cfx.learners.curves import best_losses
 from cfx.policies.context import LEVEL as EXPECTED_LEVEL
 from cfx.results.table import Column, ResultTable
@@ -62,8 +66,7 @@ class Pairs(ResultTable):
         Column("rmse_gap", "m", "RMSE of the gap on the test part"),
         Column("collisions", "1", "1 if the gap became negative", "int"),
         Column("METRIC", "as of the metric", "another metric of the test part"),
-        Column("improvement", "1", "improvement of the RMSE of speed over `fixed`"),
-        Column("improvement_over_METHOD", "1", "the same over another method"),
+        Column("improvement_over_METHOD", "1", "improvement over a method, of the job's error"),
         Column("steady_METRIC", "as of the metric", "a metric after the transient"),
         Column("full_trajectory_METRIC", "as of the metric", "a metric of the full trajectory"),
         Column("real_METRIC", "as of the metric", "a metric of the recorded driver"),
@@ -71,7 +74,7 @@ class Pairs(ResultTable):
         Column(
             "flat_NAME",
             "1",
-            "of the method `fixed`: on which share of the parameter's range the loss is within 5 %"
+            "of driver-specific parameters: on which share of the range the loss is within 5 %"
             " of its best; 1: the recording does not determine it",
         ),
         Column("forecast_METRIC", "as of the metric", "an error of the pair's forecasts"),
@@ -274,7 +277,7 @@ class KnownParameters:
         if fits is None or "noise_scale" not in fits:
             return None
         tuned = tuple(one for one in evaluation.parameters if f"median_{one.name}" in fits)
-        return cls(fits[fits["method"] == "fixed"], tuned)
+        return cls(fits[fits["method"] == "driver_specific"], tuned)
 
     @property
     def reliable(self) -> pd.Series:
@@ -378,7 +381,7 @@ class KnownParameters:
 
 
 class Fits(ResultTable):
-    """Errors of constant parameters, a row per pair and method; intervals of `fixed`."""
+    """Errors of constant parameters, a row per pair and method; intervals of `driver_specific`."""
 
     meaning = (
         "errors of constant parameters on the part that was calibrated on, and on the test part;"
@@ -397,11 +400,13 @@ class Fits(ResultTable):
         Column(
             "ends_apart",
             "1",
-            "by which share of the loss independent ends of the search of `fixed` differ; above"
-            " 0.01 the optimum may have been missed",
+            "by which share of the loss independent ends of the search of `driver_specific` differ;"
+            " above 0.01 the optimum may have been missed",
             required=False,
         ),
-        Column("median_NAME", "as of the parameter", "its median a posteriori, of `fixed`"),
+        Column(
+            "median_NAME", "as of the parameter", "its median a posteriori, of `driver_specific`"
+        ),
         Column("low_NAME", "as of the parameter", "the lower end of its 90 % interval"),
         Column("high_NAME", "as of the parameter", "the upper end"),
         Column(
@@ -439,14 +444,16 @@ class Fits(ResultTable):
 
 
 def history_metrics(history: pd.DataFrame) -> dict[str, float]:
-    """Return `history/BASE/AMOUNT/rmse_improvement`, means over pairs.
+    """Return `history/BASE/AMOUNT/improvement`, geometric over drivers.
 
     AMOUNT is `80pct` for "80 %" and `10s` for "10 s".
     """
     values = {}
-    for (base, amount), gains in history.groupby(["base", "amount"])["improvement"]:
+    for (base, amount), rows in history.groupby(["base", "amount"]):
         name = str(amount).replace(" ", "").replace("%", "pct")
-        values[f"history/{base}/{name}/rmse_improvement"] = float(gains.mean())
+        ratios = 1.0 - rows["improvement"].to_numpy(float)
+        found = improvement_statistics(np.ones_like(ratios), ratios, rows["driver"].tolist())
+        values[f"history/{base}/{name}/improvement"] = found.geometric
     return values
 
 
@@ -467,7 +474,10 @@ class Sites(ResultTable):
         Column("drivers", "1", "their drivers", "int"),
         Column("rmse_speed_METHOD", "m/s", "RMSE of speed, mean over pairs"),
         Column("rmse_gap_METHOD", "m", "RMSE of the gap, mean over pairs"),
-        Column("over_BASELINE", "1", "the policy's improvement of the RMSE of speed, mean"),
+        Column(
+            "METRIC_METHOD", "as of the metric", "the error that was minimised, mean over pairs"
+        ),
+        Column("over_BASELINE", "1", "the policy's improvement of that error, geometric"),
         Column("over_BASELINE_median", "1", "its median over pairs"),
         Column("over_BASELINE_low", "1", "lower end of the mean's 95 % interval over drivers"),
         Column("over_BASELINE_high", "1", "its upper end"),
@@ -476,10 +486,10 @@ class Sites(ResultTable):
     def metrics(self, evaluation: Evaluation) -> Mapping[str, float]:
         columns = {}
         for method in METHODS:
-            for metric in ("rmse_speed", "rmse_gap"):
+            for metric in (evaluation.judge, "rmse_speed", "rmse_gap"):
                 columns[f"{metric}_{method}"] = f"{metric}/{method}"
         for baseline in BASELINES:
-            columns[f"over_{baseline}"] = f"rmse_improvement/{baseline}"
+            columns[f"over_{baseline}"] = f"improvement/{evaluation.judge}/{baseline}"
         found: dict[str, float] = {}
         table = evaluation.tables["sites"]
         for _, row in table[table["driver_type"] == ALL_SITES].iterrows():
@@ -491,28 +501,26 @@ class Sites(ResultTable):
 
     def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[Table]:
         for scope, rows in evaluation.tables["sites"].groupby("scope", sort=False):
-            yield _sites_printed(rows, scope_label(str(scope)))
+            yield _sites_printed(rows, scope_label(str(scope)), evaluation.judge_info)
 
 
-def _sites_printed(rows: pd.DataFrame, scope: str) -> Table:
-    """Returns RMSE of speed by site and method, and the policy's improvement with its interval."""
-    table = Table(
-        title=f"By site, {scope}: RMSE of speed, m/s; improvement, %", title_justify="left"
-    )
+def _sites_printed(rows: pd.DataFrame, scope: str, judge: MetricInfo) -> Table:
+    """Returns the error by site and method, and the policy's improvement with its interval."""
+    table = Table(title=f"By site, {scope}: {judge.title}; improvement, %", title_justify="left")
     table.add_column("site")
     table.add_column("drivers", justify="right")
     known = set(rows.dropna(axis=1, how="all"))
-    methods = [one for one in METHODS if f"rmse_speed_{one}" in known and one != "shrunk"]
+    methods = [one for one in METHODS if f"{judge.name}_{one}" in known and one != "shrunk"]
     for method in methods:
-        table.add_column(method, justify="right")
+        table.add_column(short_label(method), justify="right")
     baselines = [one for one in BASELINES if f"over_{one}" in known]
     for baseline in baselines:
-        table.add_column(f"over {baseline}", justify="right")
+        table.add_column(f"over {short_label(baseline)}", justify="right")
     for _, row in rows.iterrows():
         name = escape(str(row["site"]))
         if row["driver_type"] != ALL_SITES:
             name = f"  {escape(str(row['driver_type']))}"
-        cells = [f"{row[f'rmse_speed_{method}']:.3f}" for method in methods]
+        cells = [f"{row[f'{judge.name}_{method}']:.3f}" for method in methods]
         for baseline in baselines:
             value, low, high = (row[f"over_{baseline}{end}"] for end in ("", "_low", "_high"))
             cell = f"{100 * value:+.1f}"
@@ -582,8 +590,8 @@ _WORSE = 1.1
 class Past(ResultTable):
     """What each driver's past says of the policy and of their own parameters, and what came of it.
 
-    METHOD is `fixed`, the driver's own parameters; `alone`, the policy alone; or `policy`, as it
-    was tested: beside the driver's own parameters, if it combines.
+    METHOD is `driver_specific`, the driver's own parameters; `alone`, the policy alone; or
+    `policy`, as it was tested: beside the driver's own parameters, if it combines.
     """
 
     meaning = "what each driver's past says of the policy (`protocol.combine`, `protocol=transfer`)"
@@ -623,7 +631,7 @@ class Past(ResultTable):
             "past/rmse_speed/alone": float(table["rmse_speed_alone"].mean()),
             "past/ratio/alone": _ratio(table["past_rmse_speed_alone"], table),
         }
-        for method in ("policy", "fixed"):
+        for method in ("policy", "driver_specific"):
             bound = table[f"bound_{method}"].dropna()
             if len(bound):
                 below = table.loc[bound.index, f"rmse_speed_{method}"] <= bound
@@ -646,7 +654,7 @@ class Past(ResultTable):
             yield (
                 f"Expected of {EXPECTED_LEVEL:.0%} of drivers, from their past: RMSE of speed below"
                 f" {metrics['past/bound/policy']:.3f} m/s (own parameters alone"
-                f" {metrics['past/bound/fixed']:.3f} m/s); so it is for"
+                f" {metrics['past/bound/driver_specific']:.3f} m/s); so it is for"
                 f" {metrics['past/coverage/policy']:.0%} of them (bound_policy in past.csv)."
             )
         if metrics.get("past/unlike", 0.0) > _FEW:
@@ -667,6 +675,6 @@ class Past(ResultTable):
 
 def _ratio(error: pd.Series, table: pd.DataFrame) -> float:
     """Returns the median ratio of an error in the past to that of drivers' own parameters."""
-    own = table["past_rmse_speed_fixed"]
+    own = table["past_rmse_speed_driver_specific"]
     ratio = (error / own.where(own > 0)).dropna()
     return float(ratio.median()) if len(ratio) else math.nan

@@ -37,6 +37,7 @@ from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.errors import ConfigError, PluginError
 from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.base import MetricSet
+from cfx.evaluation.metrics.objective import judged_by
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.sites import site_table
@@ -56,7 +57,7 @@ from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)
 
-_CONSTANT = ("default", "population", "fixed")
+_CONSTANT = ("default", "pooled", "driver_specific")
 
 _WINDOW_S = 0.5
 """Length of a window in the paper, and with default settings at NGSIM's time step of 0.1 s."""
@@ -75,7 +76,7 @@ def calibration_tables(
         fits: see `cfx.results.tables.Fits`; with a posterior it has `DriverPosteriors.columns`.
         Further ones with a posterior, see `DriverPosteriors.tables`.
     """
-    calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
+    calibrated = "driver_specific" in evaluation.methods and bool(evaluation.names)
     elsewhere = not isinstance(context.stepper, MemoryStepper)
     if not calibrated and settings.posterior != "none":
         log.warning(
@@ -104,9 +105,9 @@ def calibration_tables(
                     rows[f"test_{name}"] = of_method[name].to_numpy(dtype=np.float64)
             tested = [context.pairs[index] for index in chosen.tolist()]
             apart = context.calibrator.apart(tested, last)
-            if method == "fixed" and not all(map(math.isnan, apart)):
+            if method == "driver_specific" and not all(map(math.isnan, apart)):
                 rows["ends_apart"] = apart
-            if method == "fixed" and settings.posterior != "none":
+            if method == "driver_specific" and settings.posterior != "none":
                 solver = context.calibrator.solver
                 method_of = posterior_method(settings.posterior)
                 known = method_of.find(solver, batch, last, parameters, settings)
@@ -114,7 +115,7 @@ def calibration_tables(
                 tables = known.tables(ids)
             fits.append(rows)
     if not elsewhere:
-        best = _parameters(evaluation, "fixed", ids, batch.leader_length)
+        best = _parameters(evaluation, "driver_specific", ids, batch.leader_length)
         tables["slices"] = slices(context.calibrator, batch, last, best, ids)
     return {**tables, "fits": pd.concat(fits, ignore_index=True)}
 
@@ -170,6 +171,7 @@ class JobComponents:
         plugins = distributions(config.model_dump())
         registry.chosen("table", config.tables, plugins)
         registry.chosen("figure", config.figures, plugins)
+        objective = cast(Objective, registry.create("objective", config.objective))
         demo = None
         if config.demo is not None:
             demo = cast(Demo, registry.create("demo", config.demo))
@@ -178,11 +180,11 @@ class JobComponents:
             model=model,
             simulator=simulator,
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
-            objective=cast(Objective, registry.create("objective", config.objective)),
+            objective=objective,
             policy=policy,
             learner=learner,
             protocol=protocol,
-            metrics=MetricSet.of(config.metrics),
+            metrics=judged_by(MetricSet.of(config.metrics), objective),
             engine=cast(Engine, registry.create("engine", config.engine)),
             demo=demo,
         )
@@ -420,7 +422,7 @@ def description(
         "pairs": len(pairs),
         "protocol": dict(delivered.notes),
         "dropped": dropped,
-        "objective": {"name": config.objective["name"], "unit": components.objective.unit},
+        "objective": {**config.objective, "unit": components.objective.unit},
         "cfx": version(),
         "commit": commit(Path.cwd()),
     }

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cfx.errors import ConfigError
-from cfx.plugin import Purpose, Result, flatten, wording
+from cfx.plugin import Purpose, Result, comparison, flatten, wording
 from cfx_report.jobs import any_baselines
 
 GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")
@@ -194,6 +194,11 @@ def rows_over_seeds(jobs: Sequence[Result]) -> tuple[Row, ...]:
     return rows_of(jobs, "seed")
 
 
+def comparison_of(jobs: Sequence[Result]) -> comparison.Comparison:
+    """Returns the jobs beside one another, those that differ in the seed alone as one."""
+    return comparison.Comparison.of({row.name: row.jobs for row in rows_over_seeds(jobs)})
+
+
 def methods_of(rows: Sequence[Row]) -> list[str]:
     """Returns the methods that any job measured; a calibration's policy is no method of its own."""
     found: dict[str, None] = {}
@@ -203,7 +208,7 @@ def methods_of(rows: Sequence[Row]) -> list[str]:
     found.pop("policy", None)
     if any_adapts(rows):
         return [*found, "policy"]
-    return [method for method in found if method != "fixed"] + ["fixed"]
+    return [method for method in found if method != "driver_specific"] + ["driver_specific"]
 
 
 def any_adapts(rows: Sequence[Row]) -> bool:
@@ -221,4 +226,4 @@ def baselines_of(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         jobs += row.jobs
     found = any_baselines(jobs)
-    return [baseline for baseline in found if baseline in {"fixed", "population"}]
+    return [baseline for baseline in found if baseline in {"driver_specific", "pooled"}]

@@ -16,7 +16,7 @@ from rich.console import Console
 import cfx
 from cfx.app.job.console import methods_table
 from cfx.app.sweep.folder import JobStatus
-from cfx.app.sweep.summary import metric_columns, rows, summary_table, write_summary
+from cfx.app.sweep.summary import SweepSummary
 from cfx.errors import PluginError
 from cfx.evaluation.metrics.base import ALWAYS, MetricSet
 from tests.broken_plugins import QUICK
@@ -62,14 +62,14 @@ def test_a_plugins_metric_stands_in_every_result(
     overrides = [one for one in QUICK if not one.startswith("tracking")]
     result = cfx.run([*overrides, f"tracking.uri={store}", "metrics=[own,mean_gap]"])
 
-    assert result.metrics["mean_gap/fixed"] > 0
+    assert result.metrics["mean_gap/driver_specific"] > 0
     assert result.metrics["mean_gap/real"] > 0
     written = json.loads((result.folder / "metrics.json").read_text())
-    assert written["mean_gap/fixed"] == result.metrics["mean_gap/fixed"]
+    assert written["mean_gap/driver_specific"] == result.metrics["mean_gap/driver_specific"]
 
     pairs = pd.read_csv(result.folder / "pairs.csv")
-    of_fixed = pairs.loc[pairs["method"] == "fixed"]
-    assert of_fixed["mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/fixed"])
+    of_fixed = pairs.loc[pairs["method"] == "driver_specific"]
+    assert of_fixed["mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/driver_specific"])
     assert of_fixed["real_mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/real"])
     values = pd.read_parquet(result.folder / "pair_metrics.parquet")
     scopes = values.loc[values["metric"] == "mean_gap", "scope"]
@@ -83,7 +83,7 @@ def test_a_plugins_metric_stands_in_every_result(
     from mlflow import MlflowClient
 
     run = MlflowClient(store).get_run(result.run_id)
-    assert run.data.metrics["mean_gap/fixed"] == pytest.approx(written["mean_gap/fixed"])
+    assert run.data.metrics["mean_gap_m"] == pytest.approx(written["mean_gap/driver_specific"])
     assert run.data.tags["cfx.plugin.mean-gap-metrics"] == "1.0"
 
     out = io.StringIO()
@@ -101,7 +101,8 @@ def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> No
         folder = tmp_path / name
         folder.mkdir()
         metrics = {
-            "rmse_improvement/geometric": 0.1,
+            "rmse_speed/policy": 0.5,
+            "improvement/rmse_speed/driver_specific/geometric": 0.1,
             "mean_gap/policy": value,
             "theil_u/policy": 0.01,
         }
@@ -111,19 +112,20 @@ def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> No
     # A job may say nothing of its metrics.
     old = tmp_path / "old"
     old.mkdir()
-    (old / "metrics.json").write_text(json.dumps({"rmse_improvement/geometric": 0.2}))
+    (old / "metrics.json").write_text(
+        json.dumps({"improvement/rmse_speed/driver_specific/geometric": 0.2})
+    )
     (old / "data.json").write_text("{}")
     statuses[old] = JobStatus(0, "", "", ("model=old",))
 
-    table = rows(statuses)
-    write_summary(tmp_path / "summary.csv", table)
+    summary = SweepSummary.of(statuses)
+    summary.write(tmp_path / "summary.csv")
     with (tmp_path / "summary.csv").open() as file:
         read = list(csv.DictReader(file))
-    assert [row["mean_gap_policy"] for row in read] == ["12.5", "13.5", ""]
-    assert [row["theil_u_policy"] for row in read] == ["0.01", "0.01", ""]
+    assert [row["mean_gap"] for row in read] == ["12.5", "13.5", ""]
+    assert [row["theil_u"] for row in read] == ["0.01", "0.01", ""]
     out = io.StringIO()
-    shown = summary_table(table, metric_columns(list(statuses)))
-    Console(file=out, width=200, markup=False).print(shown)
+    Console(file=out, width=200, markup=False).print(summary.table())
     assert "mean gap [m]" in out.getvalue()
     assert "13.500" in out.getvalue()
     assert "Theil" not in out.getvalue()
@@ -159,11 +161,11 @@ def test_broken_metrics_are_left_out_told_and_counted(
     plugin(install, "mean_gap", GOOD)
     with caplog.at_level(logging.WARNING, logger="cfx"):
         result = cfx.run([*QUICK, "metrics=all"])
-    assert "mean_gap/fixed" in result.metrics
+    assert "mean_gap/driver_specific" in result.metrics
     said = json.loads((result.folder / "data.json").read_text())
     assert {one["name"] for one in said["metrics_left_out"]} == set(BROKEN)
     for name in BROKEN:
-        assert f"{name}/fixed" not in result.metrics
+        assert f"{name}/driver_specific" not in result.metrics
         distribution = f"{name.replace('_', '-')}-metrics"
         warned = [record for record in caplog.records if distribution in record.getMessage()]
         assert len(warned) == 1, name

@@ -16,8 +16,8 @@ from cfx.plugin import (
     style,
     wording,
 )
-from cfx_report.figures.history import BASE_LABELS, history_curves
-from cfx_report.jobs import Runs, are_calibrations, of_purpose
+from cfx_report.figures.history import history_curves
+from cfx_report.jobs import Runs, are_calibrations, metric_title, of_purpose
 from cfx_report.section import MOST, Column, Section, Sheet, View, interval, job_names, number
 
 
@@ -155,7 +155,7 @@ _AMOUNTS: tuple[Column[dict[str, Any]], ...] = (
     Column("Job", lambda row: row["job"]),
     Column(
         "Base",
-        lambda row: BASE_LABELS.get(row["base"], str(row["base"])),
+        lambda row: wording.method_label(row["base"]),
         "What the policy's answers are offsets from.",
     ),
     Column(
@@ -164,14 +164,14 @@ _AMOUNTS: tuple[Column[dict[str, Any]], ...] = (
         "Measured history before the test part; a share is of the full trajectory.",
     ),
     Column(
-        "Mean",
-        lambda row: number(row["mean"], "+.1%"),
-        "Mean improvement of the RMSE of speed over driver-specific calibration, test part.",
+        "Improvement",
+        lambda row: number(row["geometric"], "+.1%"),
+        "Over driver-specific calibration on the test part, geometric over drivers.",
     ),
     Column(
         "95 % interval",
         lambda row: interval(row["low"], row["high"]),
-        "Confidence interval of the mean, over drivers with all their pairs.",
+        "Confidence interval over drivers.",
     ),
     Column("Pairs", lambda row: number(row["pairs"], "d"), "Pairs whose improvement is defined."),
 )
@@ -223,7 +223,7 @@ The pair that improves most over driver-specific calibration, the one in the mid
 improves least, on the test part.
 {% endif %}
 {% if constant %}
-Of a calibration: the pairs with the least, the median and the largest RMSE of speed.
+Of a calibration: the pairs with the least, the median and the largest error.
 {% endif %}
 What lies outside a parameter's bounds is shaded.
 </p>
@@ -262,9 +262,9 @@ def chosen_pairs(job: Result) -> tuple[pair_lines.RankedPair, ...]:
     present = [trajectory.pair_id for trajectory in job.trajectories]
     table = job.by_pair[job.by_pair["pair_id"].isin(present)]
     if job.purpose is Purpose.CALIBRATION:
-        gains = -table[f"rmse_speed/{job.judged}"].to_numpy(dtype=float)
+        gains = -table[f"{job.judge.name}/{job.judged}"].to_numpy(dtype=float)
     else:
-        gains = table["improvement/fixed"].to_numpy(dtype=float)
+        gains = table["improvement/driver_specific"].to_numpy(dtype=float)
     return pair_lines.rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
@@ -277,7 +277,7 @@ def _title(job: Result, pair: pair_lines.RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
     if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
         improvement = wording.percent(pair.improvement, 1)
-        title += f": {improvement} over {wording.short_label('fixed')} calibration"
+        title += f": {improvement} over {wording.short_label('driver_specific')} calibration"
     return title
 
 
@@ -285,5 +285,5 @@ def _errors_of_pair(job: Result, pair: pair_lines.RankedPair) -> str:
     row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
     errors = []
     for method in job.shown_methods:
-        errors.append(f"{wording.short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
-    return f"RMSE of speed (m/s): {', '.join(errors)}"
+        errors.append(f"{wording.short_label(method)} {row[f'{job.judge.name}/{method}']:.3f}")
+    return f"{metric_title(job.judge)}: {', '.join(errors)}"
