@@ -85,7 +85,7 @@ def test_driver_specific_parameters_have_the_lowest_loss(fit: cfx.Fit) -> None:
 
 
 def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
-    table = fit.summary()
+    table = fit.summary
     assert table.loc["T", ["unit", "default"]].tolist() == ["s", 1.6]
     assert table["pooled"].tolist() == fit.pooled.tolist()
     assert table["at_bound"].between(0, 1).all()
