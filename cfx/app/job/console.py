@@ -149,7 +149,8 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
                 cells.append(_cell(metric, fitted[metric.name].get(method)))
         if method in baselines:
             cells.append(_improvement_cell(evaluation.improvements[scope][method]))
-        table.add_row(short_label(method), *cells)
+        label = result.method_label(method).replace(" over ", "\n  over ")
+        table.add_row(label, *cells)
     return table
 
 
