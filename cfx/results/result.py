@@ -669,7 +669,11 @@ def _trajectory(
 def _write_figures(folder: Path, result: Result, config: JobConfig) -> list[Path]:
     """Draws the figures that a configuration names, and says which others are installed."""
     remove_figures(folder)
-    figures = registry.chosen("figure", config.figures, distributions(config.model_dump()))
+    figures = []
+    for figure in registry.chosen("figure", config.figures, distributions(config.model_dump())):
+        is_named = config.figures == "all" or figure.name in config.figures
+        if is_named or figure.attempt(lambda one: one.is_usual(result), False):
+            figures.append(figure)
     paths = write_figures(folder, result, figures, formats=config.figure_formats)
     drawn_names = {figure.name for figure in figures}
     others = []
@@ -677,6 +681,6 @@ def _write_figures(folder: Path, result: Result, config: JobConfig) -> list[Path
         if figure.name not in drawn_names:
             others.append(figure.name)
     if others and config.figures != "none":
-        words = "Not drawn (figures=all, or figures=[own,NAME]): %s"
+        words = "Not drawn (cfx figures JOB, figures=all or figures=[own,NAME] draw them): %s"
         log.info(words, ", ".join(others), extra={"file_only": True})
     return paths
