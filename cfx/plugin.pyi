@@ -21,7 +21,13 @@ from .core.parameters import (
 )
 
 # Datasets: pairs, tables with declared columns, tracks and their pairs, driving style
-from .data import names as names, statements as statements, style as style, tracks as tracks
+from .data import (
+    names as names,
+    statements as statements,
+    steady as steady,
+    style as style,
+    tracks as tracks,
+)
 from .data.base import (
     Contents as Contents,
     Dataset as Dataset,
@@ -160,7 +166,14 @@ from .learners.base import (
 )
 
 # Evaluation: protocols, metrics, forecasts, statistics, demonstrations
-from .evaluation import forecasts as forecasts, headline as headline, statistics as statistics
+from .evaluation import (
+    forecasts as forecasts,
+    headline as headline,
+    roads as roads,
+    statistics as statistics,
+    traffic as traffic,
+    waves as waves,
+)
 from .evaluation.closed_loop import Followers as Followers, burnt_in as burnt_in
 from .evaluation.demo import DEMO_PAGE as DEMO_PAGE, Demo as Demo
 from .evaluation.metrics.base import (
