@@ -74,6 +74,19 @@ class DriveCommand(Command):
             default=31,
             help="SUMO's bit set; 31 (default): SUMO's own checks bound each speed; 0: none, exact",
         )
+        parser.add_argument(
+            "--traffic",
+            metavar="FOLDER",
+            help="stress: measure the traffic that the driver makes, in place of single events;"
+            " tables and a figure go to FOLDER. At --step, or at 0.1, 0.5 and 1 s",
+        )
+        parser.add_argument(
+            "--recorded",
+            default="human",
+            metavar="WHOSE",
+            help="whose flows stand beside those of --traffic: human (default), acc, or a file that"
+            " cfx data flows wrote",
+        )
         return parser
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
@@ -99,7 +112,8 @@ def _drive(options: argparse.Namespace) -> None:
     """
     from cfx_sumo.installed import require_sumo
 
-    require_sumo()
+    if options.traffic is None:
+        require_sumo()
     # libsumo does not get on with pyarrow, and pandas loads it where it finds it: this process does
     # without.
     # None is Python's own way to say that a module is not there.
@@ -113,6 +127,9 @@ def _drive(options: argparse.Namespace) -> None:
         output = Path(options.output).expanduser()
     with console.console_logging():
         runs = parse_drivers(options.drivers)
+        if options.traffic is not None:
+            _measure_traffic(options, runs)
+            return
         if options.scenario == "stress":
             from cfx_sumo.drive.stress import report_stress, run_stress
 
@@ -141,3 +158,38 @@ def _drive(options: argparse.Namespace) -> None:
             sumo_options=options.sumo_options,
         )
         report(run)
+
+
+def _measure_traffic(options: argparse.Namespace, runs: dict[str, str]) -> None:
+    """Measures the traffic of a driver; prints it, and writes it into a folder.
+
+    Raises:
+        ConfigError: the scenario is not `stress`.
+        CfxError: whatever `cfx_sumo.drive.traffic.measure_traffic` raises.
+    """
+    from cfx.errors import ConfigError
+    from cfx_sumo.drive.traffic import (
+        STEPS_S,
+        check_alone,
+        measure_traffic,
+        print_traffic,
+        write_traffic,
+    )
+
+    if options.scenario != "stress":
+        raise ConfigError(
+            f"--traffic belongs to the scenario stress, not to {options.scenario}: cfx drive stress"
+            " --traffic FOLDER"
+        )
+    steps = STEPS_S if options.step is None else (options.step,)
+    report = measure_traffic(
+        check_alone(runs),
+        recorded=options.recorded,
+        steps=steps,
+        seed=options.seed or 0,
+        sumo_options=options.sumo_options,
+    )
+    print_traffic(report)
+    folder = Path(options.traffic).expanduser()
+    write_traffic(report, folder)
+    print(f"Tables and figure: {folder}")
