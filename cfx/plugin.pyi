@@ -149,6 +149,7 @@ from .policies.features import (
 from .policies.heads.base import DirectHead as DirectHead, ParameterHead as ParameterHead
 from .policies.heads.stochastic import NOISE_SCALE as NOISE_SCALE, StochasticHead as StochasticHead
 from .policies.history import History as History, measured_history as measured_history
+from .policies.population import DriverPopulation as DriverPopulation
 from .policies.inputs import require_no_further_signals as require_no_further_signals
 from .policies.inputs.base import PolicyInput as PolicyInput
 from .policies.known_drivers import (

@@ -47,6 +47,12 @@ TIME_GAPS_S = (1.0, 2.5)
 EQUILIBRIUM_S = 240.0
 """s: after which the gap is measured."""
 
+FLEET_SPEEDS_MPS = (10.0, 15.0, 25.0)
+FLEET_SHARES = (0.25, 0.5, 0.75)
+_FLEET_DRIVERS = 60
+"""Speeds (m/s) and shares of drivers at which time gaps of a fleet are measured; how many drivers
+of the population, evenly over it."""
+
 _DENSITIES = tuple(float(density) for density in range(10, 66, 4))
 _RING_VEHICLES, _RING_S = 20, 600.0
 """Vehicles/km, vehicles and duration of the rings on which capacity is measured."""
@@ -205,12 +211,15 @@ class DriverTraffic:
         equilibrium: flow at each of `SPEEDS_MPS` from each of `TIME_GAPS_S`, `(S, T)`, vehicles/h.
         ring: density and flow of each ring, vehicles/km and vehicles/h, `(R, 2)`.
         dips: how much each vehicle of the platoon slows down, the leader first, m/s, `(26,)`.
+        time_gaps: quantiles (`FLEET_SHARES`) of the time gaps at which vehicles of a fleet settle
+            at `FLEET_SPEEDS_MPS`, `(3, 3)`, s; NaN for a policy that knows no drivers.
         measures: the values, beside what is usual.
     """
 
     equilibrium: Floats
     ring: Floats
     dips: Floats
+    time_gaps: Floats
     measures: tuple[Measure, ...]
 
 
@@ -228,6 +237,14 @@ class RecordedFlows(NamedTuple):
     def at(self, speeds: Floats) -> Floats:
         """Returns flows at speeds, vehicles/h; NaN where nothing was recorded."""
         return flow(speeds, self.relation.gap_at(speeds))
+
+    def time_gaps(self) -> Floats:
+        """Returns quantiles of drivers' time gaps as `DriverTraffic.time_gaps` has them."""
+        speeds, columns = np.array(FLEET_SPEEDS_MPS), []
+        for gap in (self.relation.low, self.relation.median, self.relation.high):
+            there = np.interp(speeds, self.relation.speed, gap, left=np.nan, right=np.nan)
+            columns.append(there / speeds)
+        return np.stack(columns, -1)
 
 
 def recorded_flows(reference: str | Path) -> RecordedFlows:
@@ -299,7 +316,28 @@ def driver_traffic(
     measures.append(Measure.of("ring_wave_speed", sugiyama.wave_speed, step))
     least = min(gap_on_rings, gap_in_platoon, sugiyama.least_gap)
     measures.append(Measure.of("least_gap", least, step))
-    return DriverTraffic(flows, ring, dips, tuple(measures))
+    return DriverTraffic(flows, ring, dips, fleet_time_gaps(agent, model), tuple(measures))
+
+
+def fleet_time_gaps(agent: Agent, model: DrivingModel) -> Floats:
+    """Returns quantiles of the time gaps of a fleet, as `DriverTraffic.time_gaps` has them."""
+    drivers = agent.trained_on.drivers
+    if drivers is None:
+        return np.full((len(FLEET_SPEEDS_MPS), len(FLEET_SHARES)), np.nan)
+    even = (torch.arange(_FLEET_DRIVERS, dtype=torch.float64) + 0.5) / _FLEET_DRIVERS
+    # By the first feature, so that no kind of driver is left out by chance.
+    order = drivers.features[:, 0].argsort()
+    sorted_drivers = drivers._replace(
+        features=drivers.features[order], weight=drivers.weight[order]
+    )
+    features = sorted_drivers.drawn(even).repeat(len(FLEET_SPEEDS_MPS), 1)
+    speed = torch.tensor(FLEET_SPEEDS_MPS, dtype=torch.float64).repeat_interleave(_FLEET_DRIVERS)
+    start = torch.full_like(speed, float(np.mean(TIME_GAPS_S)))
+    context = DriverContext(driver_features=features)
+    gaps = settled_gaps(agent, model, speed, start, context)
+    time_gaps = (gaps / speed).view(len(FLEET_SPEEDS_MPS), -1).numpy()
+    quantiles: Floats = np.quantile(time_gaps, FLEET_SHARES, axis=1).T
+    return quantiles
 
 
 def equilibrium_flows(agent: Agent, model: DrivingModel) -> Floats:

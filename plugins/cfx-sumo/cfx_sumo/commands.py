@@ -75,6 +75,12 @@ class DriveCommand(Command):
             help="SUMO's bit set; 31 (default): SUMO's own checks bound each speed; 0: none, exact",
         )
         parser.add_argument(
+            "--average",
+            action="store_true",
+            help="all vehicles of a policy have one average driver; otherwise each draws one of the"
+            " recorded drivers that the policy learned from, by its id and the seed",
+        )
+        parser.add_argument(
             "--traffic",
             metavar="FOLDER",
             help="stress: measure the traffic that the driver makes, in place of single events;"
@@ -153,6 +159,7 @@ def _drive(options: argparse.Namespace) -> None:
             seed=options.seed,
             output=output,
             look_ahead=options.look_ahead,
+            average=options.average,
             speed_mode=options.speed_mode,
             gui=options.gui,
             sumo_options=options.sumo_options,

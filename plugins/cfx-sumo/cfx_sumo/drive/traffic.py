@@ -180,7 +180,9 @@ def _simulate(
 
 
 def write_traffic(report: TrafficReport, folder: Path) -> list[Path]:
-    """Writes `traffic.csv`, `flows.csv`, `rings.csv`, `platoon.csv` and `traffic.png`.
+    """Writes tables (`.csv`) and a figure (`traffic.png`).
+
+    The tables are `traffic`, `flows` by speed, `rings`, `platoon` and `time_gaps` of a fleet.
 
     Returns:
         The files.
@@ -197,6 +199,7 @@ def write_traffic(report: TrafficReport, folder: Path) -> list[Path]:
         for start, value in zip(traffic.TIME_GAPS_S, alone.equilibrium[number], strict=True):
             row[f"from_{start:g}_s"] = value
         flows.append(row)
+    gaps = _gap_rows(report)
     rings = [{"density": density, "flow": flow} for density, flow in alone.ring]
     dips = [{"vehicle": number, "dip_mps": dip} for number, dip in enumerate(alone.dips)]
     tables: dict[str, Sequence[dict[str, Any]]] = {
@@ -204,6 +207,7 @@ def write_traffic(report: TrafficReport, folder: Path) -> list[Path]:
         "flows.csv": flows,
         "rings.csv": rings,
         "platoon.csv": dips,
+        "time_gaps.csv": gaps,
     }
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -224,6 +228,23 @@ def write_traffic(report: TrafficReport, folder: Path) -> list[Path]:
     return [*(folder / name for name in tables), picture]
 
 
+def _gap_rows(report: TrafficReport) -> list[dict[str, object]]:
+    """Returns quantiles of time gaps, s, of a fleet and of recorded drivers."""
+    driven, recorded = report.alone.time_gaps, report.recorded.time_gaps()
+    rows: list[dict[str, object]] = []
+    for place, speed in enumerate(traffic.FLEET_SPEEDS_MPS):
+        for number, share in enumerate(traffic.FLEET_SHARES):
+            rows.append(
+                {
+                    "speed_mps": speed,
+                    "share": share,
+                    "driven_s": driven[place, number],
+                    "recorded_s": recorded[place, number],
+                }
+            )
+    return rows
+
+
 def print_traffic(report: TrafficReport) -> None:
     """Prints a table: what was measured, what is usual, and a red word outside."""
     from cfx.plugin import console
@@ -239,8 +260,21 @@ def print_traffic(report: TrafficReport) -> None:
         f"Flows of equilibria beside those of recorded drivers ({report.recorded.of}), within"
         f" {traffic.FLOW_TOLERANCE:.0%}."
     )
+    driven, recorded = report.alone.time_gaps, report.recorded.time_gaps()
+    if np.isnan(driven).any():
+        print("All vehicles have one average driver: the policy knows no drivers to draw from.")
+    else:
+        for speed, of_fleet, there in zip(traffic.FLEET_SPEEDS_MPS, driven, recorded, strict=True):
+            print(
+                f"Time gaps of a fleet at {speed:g} m/s (25, 50, 75 % of drivers):"
+                f" {_seconds(of_fleet)} s; recorded {_seconds(there)} s"
+            )
     if report.missing:
         print(report.missing)
+
+
+def _seconds(values: Sequence[float]) -> str:
+    return ", ".join(f"{value:.2f}" for value in values)
 
 
 def check_alone(runs: dict[str, str]) -> str:

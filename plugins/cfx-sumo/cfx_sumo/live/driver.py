@@ -65,11 +65,15 @@ class DriverOptions(TypedDict, total=False):
             lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
         seed: of what a stochastic policy leaves to chance: what is drawn for a vehicle depends on
             it, the vehicle's id and the simulated time alone; None: nothing is drawn.
+        average: every vehicle has the same driver, the average one; otherwise each draws, by the
+            seed and its id, one of the recorded drivers whom the policy learned from, where it
+            knows them (`TrainedOn.drivers`).
     """
 
     look_ahead: float
     speed_mode: int
     seed: int | None
+    average: bool
 
 
 class Driver:
@@ -126,6 +130,7 @@ class Driver:
         model: DrivingModel | None = None,
         source: str = "this policy",
         seed: int | None = 0,
+        average: bool = False,
     ) -> None:
         """Makes a driver.
 
@@ -138,7 +143,8 @@ class Driver:
                 lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
             model: the driving model; None for the one that the policy was trained for.
             source: where the policy comes from, for messages.
-            seed: of what a stochastic policy leaves to chance, as in `DriverOptions`.
+            seed: of what is left to chance, as in `DriverOptions`.
+            average: whether every vehicle has the same driver, as in `DriverOptions`.
 
         Raises:
             DataError: `look_ahead` is no distance; the policy has no such network; or its driving
@@ -156,7 +162,8 @@ class Driver:
         self.model = model or cast(DrivingModel, registry.create("model", policy.model_node))
         check_model(self.model, policy.model_node["name"], source)
         self.counts = DriveCounts()
-        self._assignments = Assignments(policy, network, source)
+        of_drivers = None if average else seed
+        self._assignments = Assignments(policy, network, source, of_drivers)
         self._vehicles = KnownVehicles(policy, policy.core.head.driven_model(self.model))
         self._histories = Histories(self._vehicles)
         self._windows = PolicyWindows(policy, self._vehicles, self._assignments, seed)
