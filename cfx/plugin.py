@@ -42,6 +42,7 @@ MODULES = {
     "threads": "cfx.core.threads",
     "tracks": "cfx.data.tracks",
     "traffic": "cfx.evaluation.traffic",
+    "traffic_table": "cfx.policies.ready.traffic_table",
     "valid_range": "cfx.policies.valid_range",
     "waves": "cfx.evaluation.waves",
     "wording": "cfx.figures.wording",

@@ -156,7 +156,7 @@ from .policies.known_drivers import (
     base_of as base_of,
     driver_features_of as driver_features_of,
 )
-from .policies.ready import READY_FOLDER as READY_FOLDER
+from .policies.ready import READY_FOLDER as READY_FOLDER, traffic_table as traffic_table
 
 # Learners
 from .learners import curves as curves

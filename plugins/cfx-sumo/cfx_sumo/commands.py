@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -60,6 +61,12 @@ class DriveCommand(Command):
             "--output",
             metavar="FILE",
             help="CSV: where each driven vehicle is at each step, and its parameters",
+        )
+        parser.add_argument(
+            "--report",
+            metavar="FOLDER",
+            help="flows, headways and time-space diagrams, beside those of SUMO's own models in the"
+            " same scenario, which is run once more for it",
         )
         parser.add_argument(
             "--look-ahead",
@@ -131,6 +138,9 @@ def _drive(options: argparse.Namespace) -> None:
     output = None
     if options.output:
         output = Path(options.output).expanduser()
+    report_to = None
+    if options.report:
+        report_to = Path(options.report).expanduser()
     with console.console_logging():
         runs = parse_drivers(options.drivers)
         if options.traffic is not None:
@@ -158,6 +168,7 @@ def _drive(options: argparse.Namespace) -> None:
             step=options.step,
             seed=options.seed,
             output=output,
+            report_to=report_to,
             look_ahead=options.look_ahead,
             average=options.average,
             speed_mode=options.speed_mode,
@@ -165,6 +176,8 @@ def _drive(options: argparse.Namespace) -> None:
             sumo_options=options.sumo_options,
         )
         report(run)
+        if report_to is not None:
+            print(f"Flows, headways and diagrams: {report_to}")
 
 
 def _measure_traffic(options: argparse.Namespace, runs: dict[str, str]) -> None:
@@ -198,5 +211,11 @@ def _measure_traffic(options: argparse.Namespace, runs: dict[str, str]) -> None:
     )
     print_traffic(report)
     folder = Path(options.traffic).expanduser()
-    write_traffic(report, folder)
+    words = ["cfx", "drive", "stress", "--drivers", *options.drivers]
+    if options.recorded != "human":
+        words += ["--recorded", options.recorded]
+    if options.step is not None:
+        words += ["--step", f"{options.step:g}"]
+    words += ["--traffic", "FOLDER"]
+    write_traffic(report, folder, shlex.join(words))
     print(f"Tables and figure: {folder}")

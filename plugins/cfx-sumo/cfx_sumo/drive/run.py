@@ -26,6 +26,7 @@ from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.plugin import Task, files
 from cfx_sumo.drive.distributions import members_of
 from cfx_sumo.drive.left_out import left_out
+from cfx_sumo.drive.scenario_report import Observer, ScenarioReport, write_report
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.live.driver import DriverOptions
@@ -189,6 +190,7 @@ class ScenarioRun:
         crossings_of_sumo: how many of vehicles whose paths cross SUMO has in the same scenario
             where its own models drive all; None where there was nothing to compare with it.
         left_out: what SUMO says of the vehicles and flows of the scenario that it left out.
+        fleets: for each vType, in words, who drives its vehicles.
     """
 
     tallies: Mapping[str, Tally]
@@ -205,6 +207,7 @@ class ScenarioRun:
     collisions: Sequence[Collision] = ()
     crossings_of_sumo: int | None = None
     left_out: Sequence[str] = ()
+    fleets: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def real_time(self) -> float:
@@ -221,6 +224,7 @@ def run_scenario(
     end: float | None = None,
     step: float | None = None,
     output: Path | None = None,
+    report_to: Path | None = None,
     gui: bool = False,
     sumo_options: Sequence[str] = (),
     **options: Unpack[DriverOptions],
@@ -239,6 +243,8 @@ def run_scenario(
         end: s of simulated time.
         step: of the simulation, s; None: the scenario's, or that of the policies where it has none.
         output: a CSV file with a row for each driven vehicle and step.
+        report_to: a folder for flows, headways and time-space diagrams, beside those of the same
+            scenario with SUMO's own models (`cfx_sumo.drive.scenario_report`); None: none.
         gui: show SUMO's window, slowly enough to watch.
         sumo_options: more of SUMO's own options.
         options: as in `DriverOptions`; the seed is also SUMO's, without one it is the scenario's.
@@ -264,19 +270,31 @@ def run_scenario(
         with started(path, command, gui) as connection:
             log = Path(connection.simulation.getOption("error-log"))
             rows = _Rows.opened(stack, output, fleet) if output is not None else None
+            observer = None
+            if report_to is not None:
+                observer = Observer()
             try:
-                run = _Run(connection, fleet, path, rows, make_actor(), _name(scenario)).go(end)
+                driving = _Run(connection, fleet, path, rows, make_actor(), _name(scenario))
+                driving.observer = observer
+                run = driving.go(end)
             except OSError as error:
                 raise OutputError(
                     f"{output} cannot be written ({error.strerror or error}); name another --output"
                 ) from error
         run = replace(run, left_out=left_out(log))
         _check_on_the_road(run, path)
-        if not any(collision.crossing for collision in run.collisions):
+        has_crossings = any(collision.crossing for collision in run.collisions)
+        if not has_crossings and observer is None:
             return run
+        plain = Observer()
         command = command_line(path, sumo_options, step=step, seed=seed)
         with started(path, command, gui=False) as connection:
-            crossings = _crossings_of_sumo(connection, fleet, run.steps, make_actor())
+            crossings = _crossings_of_sumo(connection, fleet, run.steps, make_actor(), plain)
+        if observer is not None and report_to is not None:
+            both = ScenarioReport(observer.observations(), plain.observations())
+            write_report(both, report_to)
+        if not has_crossings:
+            return run
         return replace(run, crossings_of_sumo=crossings)
 
 
@@ -295,7 +313,9 @@ def _check_on_the_road(run: ScenarioRun, scenario: Path) -> None:
         )
 
 
-def _crossings_of_sumo(sumo: Any, fleet: Fleet, steps: int, actor: Actor | None) -> int:
+def _crossings_of_sumo(
+    sumo: Any, fleet: Fleet, steps: int, actor: Actor | None, observer: Observer
+) -> int:
     """Returns how many collisions of crossing paths a scenario has without drivers of cfx.
 
     Args:
@@ -303,6 +323,7 @@ def _crossings_of_sumo(sumo: Any, fleet: Fleet, steps: int, actor: Actor | None)
         fleet: whose vTypes count.
         steps: of the simulation.
         actor: acts on the simulation besides.
+        observer: looks at the vehicles.
     """
     total = 0
     before: set[tuple[str, str]] = set()
@@ -311,6 +332,7 @@ def _crossings_of_sumo(sumo: Any, fleet: Fleet, steps: int, actor: Actor | None)
             if actor is not None:
                 actor(sumo)
             sumo.simulationStep()
+            observer.look(sumo)
             touching = set()
             for found in sumo.simulation.getCollisions():
                 driven = fleet.has_type(found.colliderType) or fleet.has_type(found.victimType)
@@ -525,6 +547,7 @@ class _Run:
         self._steps = 0
         self._others = 0
         self._most = 0
+        self.observer: Observer | None = None
         self._check_types()
         self._name_members()
 
@@ -586,7 +609,7 @@ class _Run:
                 self._tallies[collision.kind].collisions += 1
             else:
                 self._tallies[collision.kind].below_min_gap += 1
-        limited, changed, outside, recorded, expected = {}, {}, {}, {}, {}
+        limited, changed, outside, recorded, expected, fleets = {}, {}, {}, {}, {}, {}
         for name, driver in self._fleet.drivers.items():
             limited[name] = driver.counts.limited / max(1, driver.counts.steps)
             changed[name] = driver.counts.changed / max(1, driver.counts.told)
@@ -595,6 +618,7 @@ class _Run:
             recorded[name] = trained_on.quantiles
             error = trained_on.expected_error
             expected[name] = "" if error is None else error.of_unseen_in_words()
+            fleets[name] = driver.fleet_in_words()
         return ScenarioRun(
             self._tallies,
             self._steps,
@@ -608,6 +632,7 @@ class _Run:
             recorded,
             expected,
             self._collisions,
+            fleets=fleets,
         )
 
     def _last(self, end: float | None) -> float:
@@ -629,6 +654,8 @@ class _Run:
             self._count(name, kind, dt)
         self._count_motions()
         self._count_teleports()
+        if self.observer is not None:
+            self.observer.look(self._sumo)
         if self._rows is not None:
             self._rows.write(self._sumo, self._fleet)
         self._others = max(self._others, self._sumo.vehicle.getIDCount() - len(vehicles))
@@ -834,6 +861,8 @@ def report(run: ScenarioRun) -> None:
             f"Collisions of vehicles whose paths cross at a junction: {crossings}; where SUMO's own"
             f" models drive all of them in the same scenario: {run.crossings_of_sumo}"
         )
+    for name, words in run.fleets.items():
+        print(f"{name}: {words}")
     for name, words in run.expected.items():
         if words:
             print(f"{name}: {words}")

@@ -22,7 +22,7 @@ import numpy as np
 from rich.text import Text
 
 from cfx.errors import NotInstalledError, OutputError, SumoError
-from cfx.plugin import Task, traffic
+from cfx.plugin import Task, files, traffic
 from cfx_sumo.drive.queue import SECONDS, QueueAtLight, queue_of
 from cfx_sumo.drive.run import command_line, started
 from cfx_sumo.drive.scenarios import ASSETS, CAR, SCENARIOS, Scenario
@@ -179,10 +179,15 @@ def _simulate(
                 fleet.step(sumo)
 
 
-def write_traffic(report: TrafficReport, folder: Path) -> list[Path]:
-    """Writes tables (`.csv`) and a figure (`traffic.png`).
+def write_traffic(report: TrafficReport, folder: Path, command: str) -> list[Path]:
+    """Writes tables (`.csv`), what a card needs (`traffic.json`) and a figure (`traffic.png`).
 
     The tables are `traffic`, `flows` by speed, `rings`, `platoon` and `time_gaps` of a fleet.
+
+    Args:
+        report: what was measured.
+        folder: made if it is not there.
+        command: that measured it.
 
     Returns:
         The files.
@@ -216,6 +221,7 @@ def write_traffic(report: TrafficReport, folder: Path) -> list[Path]:
                 writer = csv.DictWriter(file, list(rows[0]))
                 writer.writeheader()
                 writer.writerows(rows)
+        files.write_json(folder / "traffic.json", card_of(report, command))
     except OSError as error:
         raise OutputError(
             f"{folder} cannot be written ({error.strerror}); name another folder"
@@ -225,7 +231,37 @@ def write_traffic(report: TrafficReport, folder: Path) -> list[Path]:
     from cfx_sumo.drive.traffic_figure import draw_traffic
 
     picture = drawing.write_figure(draw_traffic(report), folder / "traffic.png")
-    return [*(folder / name for name in tables), picture]
+    return [*(folder / name for name in tables), folder / "traffic.json", picture]
+
+
+def card_of(report: TrafficReport, command: str) -> dict[str, Any]:
+    """Returns what stands on a policy's card, as `traffic.json` holds it."""
+    rows = []
+    for one in report.measures:
+        rows.append(
+            {
+                "measure": one.name,
+                "meaning": one.title,
+                "step_s": one.step,
+                "value": None if np.isnan(one.value) else round(one.value, 4),
+                "text": f"{one.text} {one.unit}".strip(),
+                "usual": one.usual,
+                "outside": one.word,
+            }
+        )
+    driven, recorded = report.alone.time_gaps, report.recorded.time_gaps()
+    gaps = []
+    if not np.isnan(driven).any():
+        for place, speed in enumerate(traffic.FLEET_SPEEDS_MPS):
+            quantiles = {"driven_s": driven[place], "recorded_s": recorded[place]}
+            rounded = {name: np.round(values, 3).tolist() for name, values in quantiles.items()}
+            gaps.append({"speed_mps": speed, **rounded})
+    return {
+        "command": command,
+        "recorded": report.recorded.of,
+        "rows": rows,
+        "time_gaps": gaps,
+    }
 
 
 def _gap_rows(report: TrafficReport) -> list[dict[str, object]]:

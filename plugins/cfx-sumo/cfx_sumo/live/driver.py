@@ -29,6 +29,7 @@ from cfx.plugin import (
     registry,
     require_no_further_signals,
     threads,
+    traffic_table,
 )
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
@@ -163,6 +164,7 @@ class Driver:
         check_model(self.model, policy.model_node["name"], source)
         self.counts = DriveCounts()
         of_drivers = None if average else seed
+        self._draws_drivers = of_drivers is not None
         self._assignments = Assignments(policy, network, source, of_drivers)
         self._vehicles = KnownVehicles(policy, policy.core.head.driven_model(self.model))
         self._histories = Histories(self._vehicles)
@@ -288,6 +290,24 @@ class Driver:
     def outside_in_words(self) -> str:
         """Returns how much was driven outside what the policy has learned, in words; or ""."""
         return self.counts.outside_in_words(self.policy)
+
+    def fleet_in_words(self) -> str:
+        """Returns who drives the vehicles: recorded drivers, or the average one; and for what."""
+        drivers = self.policy.trained_on.drivers
+        words = (
+            "all vehicles have one average driver; the policy knows no recorded ones"
+            " (policy.driver_features=all trains one that does)"
+        )
+        if drivers is not None and self._draws_drivers:
+            words = (
+                f"each vehicle draws one of {len(drivers.weight)} recorded drivers, by its id and"
+                " the seed"
+            )
+        elif drivers is not None:
+            words = "all vehicles have one average driver"
+        if traffic_table.is_for_traffic(self.source):
+            return words
+        return f"{words}. {self.source} {traffic_table.NOT_FOR_TRAFFIC}"
 
     def time_gaps(self, vehicles: Iterable[str]) -> Tensor:
         """Returns the time gaps of those that the model drives faster than walking, `(d,)`, s."""
