@@ -8,6 +8,7 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from cfx.errors import ConfigError
 from cfx.plugin import Command
 
 
@@ -127,6 +128,11 @@ def _drive(options: argparse.Namespace) -> None:
 
     if options.traffic is None:
         require_sumo()
+    elif options.scenario != "stress":
+        raise ConfigError(
+            f"--traffic belongs to the scenario stress, not to {options.scenario}: cfx drive stress"
+            " --traffic FOLDER"
+        )
     # libsumo does not get on with pyarrow, and pandas loads it where it finds it: this process does
     # without.
     # None is Python's own way to say that a module is not there.
@@ -187,7 +193,6 @@ def _measure_traffic(options: argparse.Namespace, runs: dict[str, str]) -> None:
         ConfigError: the scenario is not `stress`.
         CfxError: whatever `cfx_sumo.drive.traffic.measure_traffic` raises.
     """
-    from cfx.errors import ConfigError
     from cfx_sumo.drive.traffic import (
         STEPS_S,
         check_alone,
@@ -196,11 +201,6 @@ def _measure_traffic(options: argparse.Namespace, runs: dict[str, str]) -> None:
         write_traffic,
     )
 
-    if options.scenario != "stress":
-        raise ConfigError(
-            f"--traffic belongs to the scenario stress, not to {options.scenario}: cfx drive stress"
-            " --traffic FOLDER"
-        )
     steps = STEPS_S if options.step is None else (options.step,)
     report = measure_traffic(
         check_alone(runs),

@@ -50,6 +50,10 @@ def draw_report(report: ScenarioReport) -> Figure:
     for axes, (name, seen) in zip(paths, runs.items(), strict=True):
         drawn = _draw_paths(axes, seen, lane, fastest) or drawn
         axes.set_title(f"{name}: lane {lane}")
+    # Both over the same time, to be compared.
+    ends = [axes.get_xlim() for axes in paths]
+    for axes in paths:
+        axes.set_xlim(min(low for low, _ in ends), max(high for _, high in ends))
     if drawn is not None:
         figure.colorbar(drawn, ax=list(paths), label="speed [m/s]", pad=0.02)
     return figure
