@@ -94,7 +94,7 @@ class Usual(NamedTuple):
 UNLIMITED = math.inf
 USUAL = {
     "capacity": Usual(2050.0, 2400.0),
-    "dip_last": Usual(0.0, DIP_MPS, above="grows"),
+    "dip_last": Usual(0.0, DIP_MPS + 0.2, above="grows"),
     "ring_speed_std": Usual(0.5, 4.0, "calm", "violent"),
     "ring_wave_speed": Usual(-20.0, -15.0, "fast", "slow"),
     "least_gap": Usual(0.5, UNLIMITED, below="close"),
@@ -153,15 +153,23 @@ class Measure(NamedTuple):
         return cls(name, value, step, usual.low, usual.high, word)
 
     @classmethod
-    def of_flow(cls, speed: float, value: float, recorded: float, step: float) -> Measure:
-        """Returns the flow of an equilibrium, vehicles/h, beside the recorded one (or NaN)."""
+    def of_flow(cls, speed: float, flows: Floats, recorded: float, step: float) -> Measure:
+        """Returns the flow of an equilibrium, vehicles/h, in the mean over starts.
+
+        Args:
+            speed: m/s.
+            flows: from each start, `(T,)`; each of them has to be as recorded.
+            recorded: NaN where nothing was.
+            step: s.
+        """
         low, high = (1.0 - FLOW_TOLERANCE) * recorded, (1.0 + FLOW_TOLERANCE) * recorded
-        word = ""
-        if value < low:
-            word = "low"
-        elif value > high:
-            word = "high"
-        return cls(f"flow_at_{speed:g}", value, step, low, high, word)
+        words = []
+        if flows.min() < low:
+            words.append("low")
+        if flows.max() > high:
+            words.append("high")
+        mean = float(flows.mean())
+        return cls(f"flow_at_{speed:g}", mean, step, low, high, " and ".join(words))
 
     @property
     def title(self) -> str:
@@ -199,7 +207,7 @@ class Measure(NamedTuple):
         if self.unit.startswith("vehicles"):
             return f"{value:,.0f}"
         if self.name == "town_throughput":
-            return f"{value:.2f}"
+            return f"{value:.3f}"
         return f"{value:.1f}"
 
 
@@ -307,7 +315,7 @@ def driver_traffic(
     if recorded is not None:
         usual = recorded.at(np.array(SPEEDS_MPS))
     for speed, of_speed, there in zip(SPEEDS_MPS, flows, usual, strict=True):
-        measures.append(Measure.of_flow(speed, float(of_speed.mean()), float(there), step))
+        measures.append(Measure.of_flow(speed, of_speed, float(there), step))
     differ = float(100.0 * (flows.max(1) / flows.min(1) - 1.0).max())
     measures.append(Measure.of("starts_differ", differ, step))
     measures.append(Measure.of("capacity", float(ring[:, 1].max()), step))

@@ -60,9 +60,11 @@ def test_a_value_outside_has_a_word() -> None:
     assert Measure.of("capacity", 2100.0, 0.1).word == ""
     assert Measure.of("dip_last", 9.0, 0.1).word == "grows"
     assert Measure.of("ring_wave_speed", math.nan, 0.1).text == "none"
-    flow = Measure.of_flow(10.5, 1500.0, 1800.0, 0.1)
-    assert (flow.word, flow.usual) == ("low", "1,620 to 1,980")
-    assert Measure.of_flow(10.5, 1500.0, math.nan, 0.1).word == ""
+    flow = Measure.of_flow(10.5, np.array([1500.0, 1700.0]), 1800.0, 0.1)
+    assert (flow.value, flow.word, flow.usual) == (1600.0, "low", "1,620 to 1,980")
+    apart = Measure.of_flow(10.5, np.array([1500.0, 2100.0]), 1800.0, 0.1)
+    assert apart.word == "low and high"
+    assert Measure.of_flow(10.5, np.array([1500.0]), math.nan, 0.1).word == ""
     measures = (flow, Measure.of("least_gap", 2.0, 0.1))
     assert measures_from(json.loads(json.dumps(table_of(measures)))) == measures
 

@@ -38,7 +38,7 @@ class PoliciesCommand(Command):
         return 0
 
 
-_WORD = re.compile(r"\*\*([a-z]+)\*\* \|$")
+_WORD = re.compile(r"\*\*([a-z ]+)\*\* \|$")
 """A word at the end of a row of the table of traffic: a value that is not usual."""
 
 

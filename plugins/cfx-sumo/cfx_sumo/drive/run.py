@@ -17,10 +17,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO, Unpack
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.plugin import Task, files
@@ -29,8 +30,10 @@ from cfx_sumo.drive.left_out import left_out
 from cfx_sumo.drive.scenario_report import Observer, ScenarioReport, write_report
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.installed import require_sumo
-from cfx_sumo.live.driver import DriverOptions
+from cfx_sumo.live.driver import Driver, DriverOptions
 from cfx_sumo.live.fleet import Fleet
+from cfx_sumo.live.histories import WALKING_MPS
+from cfx_sumo.live.surroundings import View
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -44,6 +47,9 @@ _QUANTILES = (0.05, 0.5, 0.95)
 
 _DECIMALS = 6
 """Of the output's numbers: micrometres, however far a vehicle is from the origin."""
+
+_LANES_EVERY_S = 0.5
+"""s: lanes are looked at no more often, as SUMO has to be asked for each vehicle."""
 
 _LISTED = 10
 """Collisions, and vehicles left out, that the report lists."""
@@ -519,6 +525,32 @@ def _reason(error: Exception) -> str:
     return said
 
 
+class _Motions(NamedTuple):
+    """What vehicles of a driver do, `(D,)` each; SI units.
+
+    Attributes:
+        names: of the vehicles.
+        speed, acceleration: theirs.
+        behind: how many the model drives behind a leader.
+        time_gaps: of those that are faster than walking, s.
+    """
+
+    names: list[str]
+    speed: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    behind: int
+    time_gaps: NDArray[np.float64]
+
+    @classmethod
+    def of_view(cls, names: list[str], view: View) -> _Motions:
+        """Returns what a driver has seen of all of its vehicles."""
+        speed, behind = view.seen.speed.numpy(), len(view.following)
+        gap = view.seen.gap.numpy()[:behind]
+        moves = speed[:behind] > WALKING_MPS
+        time_gaps = gap[moves] / speed[:behind][moves]
+        return cls(names, speed, view.seen.acceleration.numpy(), behind, time_gaps)
+
+
 class _Run:
     """One run of a scenario."""
 
@@ -539,7 +571,10 @@ class _Run:
         self._rows = rows
         self._tallies = {name: Tally() for name in fleet.drivers}
         self._type_of: dict[str, str] = {}
-        self._lanes: dict[str, tuple[str, int]] = {}
+        self._lanes: dict[str, str] = {}
+        self._lanes_next = -math.inf
+        self._counted: Mapping[str, str] | None = None
+        self._names: dict[str, list[str]] = {}
         self._braking: set[str] = set()
         self._collisions: list[Collision] = []
         self._touching: dict[tuple[str, str], Collision] = {}
@@ -649,10 +684,14 @@ class _Run:
         """Notes what the last step did, and writes it down."""
         self._steps += 1
         vehicles = self._fleet.vehicles
-        self._type_of |= vehicles
-        for name, kind in vehicles.items():
-            self._count(name, kind, dt)
-        self._count_motions()
+        if vehicles is not self._counted:
+            self._counted, self._names = vehicles, self._by_kind(vehicles)
+            self._type_of |= vehicles
+            for kind, names in self._names.items():
+                self._tallies[kind].vehicles.update(names)
+        for kind, names in self._names.items():
+            self._count(kind, names, dt)
+        self._count_lanes(vehicles)
         self._count_teleports()
         if self.observer is not None:
             self.observer.look(self._sumo)
@@ -661,26 +700,71 @@ class _Run:
         self._others = max(self._others, self._sumo.vehicle.getIDCount() - len(vehicles))
         self._most = max(self._most, len(vehicles))
 
-    def _count(self, name: str, kind: str, dt: float) -> None:
-        """Notes what the last step did to a vehicle of the fleet."""
-        vehicle, tally = self._sumo.vehicle, self._tallies[kind]
-        tally.vehicles.add(name)
-        tally.steps += 1
-        tally.metres += vehicle.getSpeed(name) * dt
-        if self._fleet.drivers[kind].follows(name):
-            tally.behind += 1
-        lane = vehicle.getRoadID(name), vehicle.getLaneIndex(name)
-        before = self._lanes.get(name, lane)
-        if before[0] == lane[0] and before[1] != lane[1]:
-            tally.lane_changes += 1
-        self._lanes[name] = lane
-        acceleration = vehicle.getAcceleration(name)
-        tally.hardest_braking = max(tally.hardest_braking, -acceleration)
-        if acceleration >= -self._own_decel(name) - 1e-6:
-            self._braking.discard(name)
-        elif name not in self._braking:
-            self._braking.add(name)
-            tally.hard_brakings += 1
+    def _by_kind(self, vehicles: Mapping[str, str]) -> dict[str, list[str]]:
+        """Returns the vehicles of each vType that has some."""
+        names: dict[str, list[str]] = {}
+        for name, kind in vehicles.items():
+            names.setdefault(kind, []).append(name)
+        return names
+
+    def _count(self, kind: str, names: list[str], dt: float) -> None:
+        """Notes what the last step did to the vehicles of a vType."""
+        tally, motions = self._tallies[kind], self._motions(self._fleet.drivers[kind], names)
+        speed, acceleration = motions.speed, motions.acceleration
+        tally.steps += len(names)
+        tally.behind += motions.behind
+        tally.metres += float(speed.sum()) * dt
+        tally.hardest_braking = max(tally.hardest_braking, -float(acceleration.min()))
+        tally.speeds.add(speed)
+        tally.accelerations.add(acceleration)
+        tally.braking.add((-acceleration).clip(min=0.0))
+        tally.time_gaps.add(motions.time_gaps)
+        brakes = set()
+        for number in (acceleration < 0.0).nonzero()[0].tolist():
+            name = motions.names[number]
+            if acceleration[number] < -self._own_decel(name) - 1e-6:
+                brakes.add(name)
+        tally.hard_brakings += len(brakes - self._braking)
+        if self._braking:
+            self._braking -= set(names)
+        self._braking |= brakes
+
+    def _motions(self, driver: Driver, names: list[str]) -> _Motions:
+        """Returns what vehicles of a driver do.
+
+        The driver has just looked at them, unless it has taken no step of its model. SUMO is asked
+        again only then, or where vehicles of other vTypes have the same driver.
+        """
+        view = driver.looked_at()
+        if view is not None and len(view.order) == len(names):
+            looked = [*view.following, *view.alone]
+            if set(looked) == set(names):
+                return _Motions.of_view(looked, view)
+        vehicle = self._sumo.vehicle
+        motions = []
+        for name in names:
+            motions.append((vehicle.getSpeed(name), vehicle.getAcceleration(name)))
+        speed, acceleration = np.array(motions, dtype=np.float64).T
+        behind = sum(1 for name in names if driver.follows(name))
+        return _Motions(names, speed, acceleration, behind, driver.time_gaps(names).numpy())
+
+    def _count_lanes(self, vehicles: Mapping[str, str]) -> None:
+        """Counts changes of lane on the same edge; they are looked for now and then."""
+        now = self._sumo.simulation.getTime()
+        if now < self._lanes_next - 1e-6:
+            return
+        self._lanes_next = now + _LANES_EVERY_S
+        lane_of, lanes, before = self._sumo.vehicle.getLaneID, {}, self._lanes
+        for name, kind in vehicles.items():
+            lanes[name] = lane = lane_of(name)
+            last = before.get(name, lane)
+            if lane == last:
+                continue
+            edge, _, index = lane.rpartition("_")
+            last_edge, _, last_index = last.rpartition("_")
+            if edge and edge == last_edge:
+                self._tallies[kind].lane_changes += abs(int(index) - int(last_index))
+        self._lanes = lanes
 
     def _own_decel(self, name: str) -> float:
         """Returns the `decel` of a vehicle's vType, m/s2, whatever drivers make of it meanwhile."""
@@ -688,24 +772,6 @@ class _Run:
             kind = self._sumo.vehicle.getTypeID(name).partition("@")[0]
             self._decel[name] = float(self._sumo.vehicletype.getDecel(kind))
         return self._decel[name]
-
-    def _count_motions(self) -> None:
-        """Notes speeds, accelerations and time gaps of all vehicles of the fleet."""
-        vehicle = self._sumo.vehicle
-        motions: dict[str, list[tuple[float, float]]] = {name: [] for name in self._tallies}
-        for name, kind in self._fleet.vehicles.items():
-            motions[kind].append((vehicle.getSpeed(name), vehicle.getAcceleration(name)))
-        for kind, pairs in motions.items():
-            if not pairs:
-                continue
-            values = np.array(pairs)
-            tally = self._tallies[kind]
-            tally.speeds.add(values[:, 0])
-            tally.accelerations.add(values[:, 1])
-            tally.braking.add((-values[:, 1]).clip(min=0.0))
-        for kind, driver in self._fleet.drivers.items():
-            names = [name for name, its in self._fleet.vehicles.items() if its == kind]
-            self._tallies[kind].time_gaps.add(driver.time_gaps(names).numpy())
 
     def _note_collisions(self, dt: float) -> None:
         """Notes the collisions that SUMO reports after a step; one that goes on is one."""

@@ -177,6 +177,7 @@ class Driver:
         self._swept = math.nan
         self._now = -math.inf
         self._clock: Clock | None = None
+        self._view: View | None = None
 
     @classmethod
     def load(
@@ -314,6 +315,14 @@ class Driver:
         following = (name for name in vehicles if self.follows(name))
         return self._histories.time_gaps(self._vehicles.rows(following))
 
+    def looked_at(self) -> View | None:
+        """Returns what the last call of `step` saw, if it drove all vehicles that it was given.
+
+        None before the first call, after one that watched, and in steps shorter than the policy's,
+        between two of which vehicles hold their acceleration.
+        """
+        return self._view
+
     def gap_to(self, vehicle: str, leader: str) -> float | None:
         """Returns the gap at the last step, bumper to bumper, m; None behind another or nobody."""
         row = self._vehicles.row(vehicle)
@@ -386,6 +395,7 @@ class Driver:
             between = list(compress(names, (early & (times != now)).tolist()))
             names, rows = list(compress(names, (~early).tolist())), rows[~early]
         view = look(connection, names, self.look_ahead)
+        self._view = view if drive and not between else None
         rows = rows[view.order]
         if drive:
             self._hold(connection, between, now, clock)
