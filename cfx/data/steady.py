@@ -21,6 +21,19 @@ if TYPE_CHECKING:
 
     from cfx.data.pairs import PairBatch, PairSet
 
+__all__ = [
+    "EDGES_MPS",
+    "VEHICLE_M",
+    "GapRelation",
+    "SteadyFollowing",
+    "flow",
+    "relation_from",
+    "relation_of",
+    "relations_of_types",
+    "steady_following",
+]
+"""What plugins may use, as `cfx.plugin.steady`."""
+
 EDGES_MPS = (0.5, 3.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0)
 """m/s: the ranges of speed in which gaps are averaged, wider where recordings are fewer."""
 

@@ -26,6 +26,22 @@ from cfx.policies.inputs import require_no_further_signals
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Start
 
+__all__ = [
+    "FREE_M",
+    "START_HEADWAY",
+    "Bottleneck",
+    "Driven",
+    "Lanes",
+    "Road",
+    "RoadKind",
+    "joined",
+    "open_roads",
+    "platoons",
+    "ring_roads",
+    "simulate_roads",
+]
+"""What plugins may use, as `cfx.plugin.roads`."""
+
 RoadKind = Literal["ring", "open", "platoon"]
 
 START_HEADWAY = 2.0

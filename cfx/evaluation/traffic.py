@@ -20,7 +20,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -38,6 +38,27 @@ from cfx.models.base import DrivingModel
 from cfx.policies.agent import Agent, AgentState
 from cfx.policies.context import UNSEEN, DriverContext
 
+__all__ = [
+    "DIP_MPS",
+    "FLEET_SHARES",
+    "FLEET_SPEEDS_MPS",
+    "FLOW_TOLERANCE",
+    "PLATOON",
+    "SPEEDS_MPS",
+    "TIME_GAPS_S",
+    "USUAL",
+    "DriverTraffic",
+    "Measure",
+    "RecordedFlows",
+    "Usual",
+    "driver_traffic",
+    "fleet_time_gaps",
+    "recorded_flows",
+    "settled_gaps",
+    "table_of",
+]
+"""What plugins may use, as `cfx.plugin.traffic`."""
+
 SPEEDS_MPS = (2.0, 4.5, 7.5, 10.5, 14.0, 18.0, 22.5, 27.5, 32.0)
 """m/s: speeds of the leaders behind whom equilibria are measured."""
 
@@ -48,10 +69,13 @@ EQUILIBRIUM_S = 240.0
 """s: after which the gap is measured."""
 
 FLEET_SPEEDS_MPS = (10.0, 15.0, 25.0)
+"""m/s: speeds at which time gaps of a fleet are measured."""
+
 FLEET_SHARES = (0.25, 0.5, 0.75)
+"""Shares of drivers whose time gaps are shorter."""
+
 _FLEET_DRIVERS = 60
-"""Speeds (m/s) and shares of drivers at which time gaps of a fleet are measured; how many drivers
-of the population, evenly over it."""
+"""Drivers of the population, evenly over it."""
 
 _DENSITIES = tuple(float(density) for density in range(10, 66, 4))
 _RING_VEHICLES, _RING_S = 20, 600.0
@@ -63,8 +87,11 @@ _SETTLED = 0.6
 PLATOON = 25
 """Vehicles behind the leader."""
 
-DIP_FROM_MPS, DIP_MPS, _DIP_MPS2, _DIP_S = 15.0, 5.0, 1.0, 5.0
-"""Speed before a dip, how deep it is, how hard the leader changes speed, how long it stays slow."""
+DIP_MPS = 5.0
+"""m/s: how deep the dip of a platoon's leader is."""
+
+_DIP_FROM_MPS, _DIP_MPS2, _DIP_S = 15.0, 1.0, 5.0
+"""Speed before the dip, how hard the leader changes speed, how long it stays slow."""
 
 _DIP_BEGINS_S, _DIP_LASTS_S = 300.0, 200.0
 _AVERAGED_S = 10.0
@@ -463,7 +490,7 @@ def _rings(agent: Agent, model: DrivingModel, seed: int) -> tuple[Floats, float]
 
 def _dips(agent: Agent, model: DrivingModel, seed: int) -> tuple[Floats, float]:
     """Returns how much each vehicle of a platoon slows down, m/s, and the least gap, m."""
-    lanes = roads.platoons([DIP_FROM_MPS], PLATOON + 1, 1, VEHICLE_M)
+    lanes = roads.platoons([_DIP_FROM_MPS], PLATOON + 1, 1, VEHICLE_M)
     steps = round((_DIP_BEGINS_S + _DIP_LASTS_S) / agent.dt)
     time = agent.dt * torch.arange(1, steps + 1, dtype=torch.float64) - _DIP_BEGINS_S
     change = DIP_MPS / _DIP_MPS2
@@ -523,16 +550,3 @@ def table_of(measures: Sequence[Measure]) -> list[dict[str, object]]:
             }
         )
     return rows
-
-
-def measures_from(rows: Sequence[Mapping[str, object]]) -> tuple[Measure, ...]:
-    """Returns the measures of `table_of`."""
-    measures = []
-    for row in rows:
-        numbers = []
-        for name in ("value", "step_s", "usual_low", "usual_high"):
-            value = row[name]
-            numbers.append(math.nan if value is None else float(cast(float, value)))
-        value, step, low, high = numbers
-        measures.append(Measure(str(row["measure"]), value, step, low, high, str(row["outside"])))
-    return tuple(measures)

@@ -10,6 +10,16 @@ from typing import Any
 
 from cfx.policies.ready import SCHEME, card_of, folder_of_ready_made, is_ready_made
 
+__all__ = [
+    "FILE",
+    "NOT_FOR_TRAFFIC",
+    "is_for_traffic",
+    "outside_words",
+    "traffic_lines",
+    "traffic_of",
+]
+"""What plugins may use, as `cfx.plugin.traffic_table`."""
+
 FILE = "traffic.json"
 
 NOT_FOR_TRAFFIC = "reproduces one recording; not for traffic"

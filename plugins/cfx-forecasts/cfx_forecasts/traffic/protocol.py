@@ -132,7 +132,7 @@ class TrafficProtocol(FoldsOrFinished):
 
     Folds, calibration, training and the test part are those of `across_drivers`; with `run` they
     are those of `transfer`, and nothing is trained. Beyond it, test drivers are set on roads, all
-    at once (`cfx_forecasts.traffic.roads`): on ring roads of each density, on open roads with a
+    at once (`cfx.evaluation.roads`): on ring roads of each density, on open roads with a
     bottleneck at each demand, and in platoons behind leaders that keep their speed. Each vehicle is
     a test driver, drawn with replacement; every method has the same drivers at the same places:
 

@@ -67,7 +67,9 @@ def _draw_flows(axes: Axes, report: TrafficReport) -> None:
 
 def _draw_rings(axes: Axes, report: TrafficReport) -> None:
     usual = traffic.USUAL["capacity"]
-    axes.axhspan(usual.low, usual.high, color=colours.PALE, label="usual capacity")
+    axes.axhspan(
+        usual.low, usual.high, color=colours.EDGE, alpha=0.25, linewidth=0, label="usual capacity"
+    )
     density, flow = report.alone.ring.T
     axes.plot(density, flow, color=colours.colour_of("policy"), marker="o", markersize=3)
     axes.set(xlabel="density [vehicles/km]", title="rings", ylim=(0, None))
