@@ -40,6 +40,7 @@ def draw_report(report: ScenarioReport) -> Figure:
             headways.hist(
                 gaps, bins, density=True, histtype="step", linewidth=1.8, color=shades[name]
             )
+    flows.margins(0.1)
     flows.set(xlabel="mean speed of a lane [m/s]", ylabel="flow [vehicles/h]", title="lanes")
     flows.set(xlim=(0, None), ylim=(0, None))
     flows.legend(loc="upper left")
