@@ -40,7 +40,7 @@ def recorded() -> TrainingData:
             index=torch.arange(count),
             split=Split.none(pair_set, WINDOWS),
             network=torch.zeros(count, dtype=torch.int64),
-            fixed=model.space.defaults().expand(count, -1).clone(),
+            start=model.space.defaults().expand(count, -1).clone(),
             drivers=tuple(drivers),
         ),
         windows=WINDOWS,
