@@ -9,6 +9,7 @@ guess is wrong by a factor of a thousand.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -49,8 +50,8 @@ _MARKS = {".": ",", ",": "."}
 
 _SPOKEN = {".": "a point", ",": "a comma"}
 
-_FEW_DECIMALS = 3
-"""Decimals that may be the last three digits of a whole number."""
+_WITH_ZEROS = re.compile(r"-?[0-9]+,000")
+"""A name that is a whole number with three decimals, or one of thousands."""
 
 
 def _fraction(mark: str) -> str:
@@ -466,6 +467,10 @@ def names_in(column: Any) -> NameColumn:
     written: list[str | None] = []
     for cell in cells:
         written.append(name_of(cell) or None)
+    named = [name for name in written if name is not None]
+    if len(named) > 1 and all(_WITH_ZEROS.fullmatch(name) for name in named):
+        # All of several ids are no multiples of 1000: the comma marks decimals.
+        written = [None if name is None else name.partition(",")[0] for name in written]
     merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
     known = np.append(merged, -1).astype(np.int64)
     return NameColumn(known[codes], list(names))

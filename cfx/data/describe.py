@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -354,10 +355,63 @@ def dataset_of(path: Path) -> str:
         columns = listed(start.columns, 20) or "none: it is a folder"
         raise DataError(
             f"{path}: no dataset knows this layout. Columns found: {columns}. Known layouts:"
-            f" {'; '.join(layouts)}. Name the columns of a table of pairs (data.columns, see"
-            " docs/how-to/own-recording.md), or see docs/readers.md"
+            f" {'; '.join(layouts)}. {_own_columns(path, start.columns)}"
         )
     return "ngsim"  # whose reader says what is wrong with a file without column names
+
+
+_AHEAD = "lead|ahead|front|prec|target|other"
+_QUANTITIES = {
+    "pair_id": "^(pair|trip|ride|run|event|session|id|drive)[ _-]?(id|no|number)?$",
+    "time": "^(t|time|timestamp|seconds|sec|zeit)([ _(]|$)",
+    "leader_speed": rf"({_AHEAD}).*(speed|vel|kmh|km/h|mph|mps)|(speed|vel|^v).*({_AHEAD})|^vl$",
+    "speed": "speed|vel|^v([ _(]|$)|kmh|km/h|mph|mps",
+    "gap": "gap|dist|spacing|range|clearance|abstand",
+}
+"""What a table of pairs has at least, and what its columns are called elsewhere."""
+
+_WRITTEN_UNITS = {
+    "km/h": "km/?h|kph",
+    "mph": "mph",
+    "ft/s": "ft/s|fps|ft_s",
+    "ms": "(^|[ _(])(ms|millis)",
+    "us": "(^|[ _(])(us|micros)",
+    "ns": "(^|[ _(])(ns|nanos)",
+    "ft": "(^|[ _(])(ft|feet)([ _)]|$)",
+}
+"""Units that names of columns end in."""
+
+
+def _own_columns(path: Path, columns: Sequence[str]) -> str:
+    """Returns what to write for a table whose columns have names of their own."""
+    taken: dict[str, str] = {}
+    units = []
+    for quantity, expression in _QUANTITIES.items():
+        for name in columns:
+            if name not in taken.values() and re.search(expression, name.lower()):
+                taken[quantity] = name
+                break
+        unit = _unit_in(taken.get(quantity, ""), quantity)
+        if unit:
+            units.append((quantity, unit))
+    words = []
+    for quantity in _QUANTITIES:
+        words.append(f"data.columns.{quantity}={shlex.quote(taken.get(quantity, 'COLUMN'))}")
+    words += [f"data.units.{quantity}={unit}" for quantity, unit in units]
+    return (
+        "If it is a table of pairs, a row for each pair and frame, say what its columns are, and"
+        f" their units: cfx data describe {shlex.quote(str(path))} {' '.join(words)}"
+        " (docs/how-to/own-recording.md); else see docs/readers.md"
+    )
+
+
+def _unit_in(name: str, quantity: str) -> str:
+    """Returns the unit that a column's name says it has; "" if none."""
+    fits = {"time": ("ms", "us", "ns"), "gap": ("ft",)}.get(quantity, ("km/h", "mph", "ft/s"))
+    for unit in fits:
+        if quantity != "pair_id" and re.search(_WRITTEN_UNITS[unit], name.lower()):
+            return unit
+    return ""
 
 
 def _usable(entry: Entry) -> type[Dataset] | None:

@@ -83,10 +83,18 @@ _KINDS = {
 
 _PICKLES = re.compile(rb"\x80[\x02-\x05][\x95}(\]c]")
 
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
+
+_CONTROL = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
+"""Bytes below 32 that no text has: all but tab, line feed, form feed and carriage return."""
+
 _TAR_AT, _TAR = 257, b"ustar"
 
 _HEAD = 1 << 16
 """Bytes that are looked at before a file is read."""
+
+_LINES = 200
+"""Lines among which a table begins."""
 
 _COLUMN = "recording="
 
@@ -96,7 +104,7 @@ class FileStart(NamedTuple):
 
     Attributes:
         magic: the first bytes; b"" for a folder.
-        lines: the first lines of a text, unpacked; () for anything else.
+        lines: the first lines of a text, unpacked, without remarks above; () for anything else.
     """
 
     path: Path
@@ -133,13 +141,62 @@ def beginning(path: Path) -> FileStart:
     if start in {b"\x93NUM", b"MATL"} or arrays_in_zip(path):
         return FileStart(path, start, ())
     head = read_head(path)
+    text = ""
+    is_utf16 = head.startswith(_UTF16)
+    if not head.startswith(PARQUET) and (is_utf16 or not _CONTROL.search(head)):
+        text = decoded(path, head)
+    lines = text.splitlines()[:_LINES]
+    lines = lines[first_line_of(lines) :]
+    if lines:
+        lines[0] = without_mark(lines[0])
+    return FileStart(path, head[:4], tuple(lines[:20]))
+
+
+_REMARK = "#"
+
+
+def first_line_of(lines: Sequence[str]) -> int:
+    """Returns where a text begins, behind remarks: lines that begin with #.
+
+    The last of them is the header where numbers follow it, as NumPy writes it.
+    """
+    header = 0
+    for at, line in enumerate(lines):
+        if line.lstrip().startswith(_REMARK):
+            header = at
+        elif line.strip():
+            is_header = lines[header].lstrip().startswith(_REMARK) and not has_letters(line)
+            return header if is_header else at
+    return 0
+
+
+def without_mark(line: str) -> str:
+    """Returns a header without the mark of a remark."""
+    return line.lstrip().removeprefix(_REMARK).lstrip() if line.lstrip()[:1] == _REMARK else line
+
+
+def decoded(path: Path, head: bytes) -> str:
+    """Returns the beginning of a file as text.
+
+    Raises:
+        DataError: it is no text, or is in another encoding than UTF-8.
+    """
+    if head.startswith(_UTF16):
+        raise DataError(f"{path}: is in UTF-16; save it as UTF-8")
+    is_binary = _CONTROL.search(head) is not None
     try:
-        text = head.decode("utf-8-sig", errors="strict" if len(head) < _HEAD else "ignore")
-    except UnicodeDecodeError:
-        text = ""
-    if "\0" in text or head.startswith(PARQUET):
-        text = ""
-    return FileStart(path, head[:4], tuple(text.splitlines()[:20]))
+        text = head.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        # A character that the end of the block cuts in two is none of the file's faults.
+        if error.start < len(head) - 4 and not is_binary:
+            raise DataError(f"{path}: is no text in UTF-8; write the file again in UTF-8") from None
+        text = head.decode("utf-8-sig", errors="ignore")
+    if is_binary:
+        raise DataError(
+            f"{path}: is a binary file, not text; give a CSV or text file (packed is fine),"
+            " or parquet for data=tidy"
+        )
+    return text
 
 
 _SEPARATORS = (";", "\t", "|", ",")

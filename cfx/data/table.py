@@ -37,13 +37,16 @@ from cfx.data.files import (
     Floats,
     Ints,
     cells_of,
+    decoded,
     first_bytes,
+    first_line_of,
     has_letters,
     open_text,
     parquet_source,
     read_head,
     separator_of,
     unpacking,
+    without_mark,
 )
 from cfx.data.frames import frame_of_any
 from cfx.errors import DataError, first_line, listed, nearest
@@ -53,10 +56,6 @@ if TYPE_CHECKING:
 
 _BLOCK = 1 << 22
 """Bytes that are parsed at once."""
-
-_UTF16 = (b"\xff\xfe", b"\xfe\xff")
-_CONTROL = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
-"""Bytes below 32 that no text has: all but tab, line feed, form feed and carriage return."""
 
 _PANDAS_INDEX = "__index_level_0__"
 """A column that pandas adds to parquet files for the rows' index; it is not the user's."""
@@ -513,24 +512,21 @@ def _read_text(path: Path, layout: Layout) -> Table:
 def _read_header(path: Path, layout: Layout) -> _Text:
     """Reads the header and the separator of a text file."""
     head = read_head(path)
-    if head.startswith(_UTF16):
-        raise DataError(f"{path}: is in UTF-16; save it as UTF-8")
-    lines = _decoded(path, head).splitlines()[layout.above :]
-    first = ""
-    for line in lines:
-        if line.strip():
-            first = line
-            break
-    if not first:
+    lines = decoded(path, head).splitlines()
+    above = first_line_of(lines) + layout.above
+    while above < len(lines) and not lines[above].strip():
+        above += 1
+    if above >= len(lines):
         raise DataError(f"{path}: the file holds no rows")
+    first = without_mark(lines[above])
     has_header = has_letters(first.lower().replace("e+", "").replace("e-", ""))
     delimiter = separator_of(first, spaces=layout.spaces)
     cells = cells_of(first, delimiter)
     if not has_header:
-        return _Text(path, delimiter, _names_without_header(path, layout, len(cells)), layout.above)
+        return _Text(path, delimiter, _names_without_header(path, layout, len(cells)), above)
     if delimiter == " " and len(cells) > 1 and not layout.spaces:
         raise DataError(f"{path}: the columns are separated by spaces; write the file with commas")
-    return _Text(path, delimiter, tuple(cells), layout.above + 1)
+    return _Text(path, delimiter, tuple(cells), above + 1)
 
 
 def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, ...]:
@@ -550,24 +546,6 @@ def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, 
     raise DataError(
         f"{path}: the first row must hold the column names of {layout.name}: {listed(needed, 20)}"
     )
-
-
-def _decoded(path: Path, head: bytes) -> str:
-    """Returns the beginning of a file as text; raises DataError if it is none."""
-    is_binary = _CONTROL.search(head) is not None
-    try:
-        text = head.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        # A character that the end of the block cuts in two is none of the file's faults.
-        if error.start < len(head) - 4 and not is_binary:
-            raise DataError(f"{path}: is no text in UTF-8; write the file again in UTF-8") from None
-        text = head.decode("utf-8-sig", errors="ignore")
-    if is_binary:
-        raise DataError(
-            f"{path}: is a binary file, not text; give a CSV or text file (gzip is fine),"
-            " or parquet for data=tidy"
-        )
-    return text
 
 
 def _parsed(text: _Text, matches: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:

@@ -125,6 +125,10 @@ def test_ids_that_a_spreadsheet_writes_with_decimals_are_the_same(tmp_path: Path
     frame.to_csv(tmp_path / "t.csv", index=False, sep=";")
     pair = read_tidy(tmp_path / "t.csv")[0]
     assert (pair.leader_id, pair.follower_id) == ("11", "7")
+    ids = {name: f"{number},000" for number, name in enumerate(FRAME["pair_id"].unique(), start=1)}
+    frame["pair_id"] = FRAME["pair_id"].map(ids)
+    frame.to_csv(tmp_path / "t.csv", index=False, sep=";")
+    assert read_tidy(tmp_path / "t.csv").ids == ["1", "2"]
 
 
 def test_a_unit_is_refused_where_dates_have_their_own(tmp_path: Path) -> None:

@@ -213,3 +213,15 @@ def test_says_what_a_noisy_gap_makes_of_positions(tmp_path: Path) -> None:
     text = describe(tmp_path / "t.csv").text
     assert "moves backwards" in text
     assert "the noise of the gap while vehicles stand or creep" in text
+
+
+def test_a_table_with_names_of_its_own_is_told_the_line_that_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "dashcam.csv"
+    path.write_text("trip;t;speed_kmh;ahead_kmh;distance\n1,0;0,0;36,0;36,5;12,5\n")
+    with pytest.raises(DataError) as error:
+        describe(path)
+    assert (
+        f"cfx data describe {path} data.columns.pair_id=trip data.columns.time=t"
+        " data.columns.leader_speed=ahead_kmh data.columns.speed=speed_kmh"
+        " data.columns.gap=distance data.units.leader_speed=km/h data.units.speed=km/h"
+    ) in str(error.value)

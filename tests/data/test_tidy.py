@@ -358,6 +358,14 @@ def test_bom_blank_lines_and_windows_line_ends_do_no_harm(
     same(read_tidy(tmp_path / "w.csv"), read(good, tmp_path))
 
 
+def test_remarks_above_the_header_do_no_harm(good: pd.DataFrame, tmp_path: Path) -> None:
+    wanted = read(good, tmp_path)
+    text = good.to_csv(index=False)
+    for above in ("# by a recorder, at 10 Hz\n#\n", "\n\n", "# by a recorder\n\n"):
+        (tmp_path / "rec.csv").write_text(above + text)
+        same(read_tidy(tmp_path / "rec.csv"), wanted)
+
+
 # --- gaps in place of positions, and who drives ---------------------------------------------------
 
 LENGTHS_AND_POSITIONS = ["leader_length_m", "leader_position_m", "follower_position_m"]

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -164,7 +164,54 @@ def read_rows(path: Path) -> FcdRows:
     rows = _of_xml(path) if is_xml else _of_table(path)
     if not len(rows.step):
         raise DataError(f"{path}: holds no vehicles")
-    return rows
+    back = np.flatnonzero(rows.numbers["speed"] < 0)
+    if len(back):
+        raise DataError(
+            f"{_where(rows, int(back[0]))}: speed={rows.numbers['speed'][back[0]]:g} is negative"
+            f" ({len(back)} such rows); speeds count along the lane"
+        )
+    return _once(rows)
+
+
+def _where(rows: FcdRows, row: int) -> str:
+    """Says where a row is."""
+    time = rows.times[rows.step[row]]
+    return f"{rows.path}, vehicle '{rows.texts['id'][row]}' at {time:g} s"
+
+
+def _once(rows: FcdRows) -> FcdRows:
+    """Returns rows without those that stand there twice.
+
+    Raises:
+        DataError: a vehicle has two different rows at one time.
+    """
+    _, vehicle = np.unique(rows.texts["id"], return_inverse=True)
+    order = np.lexsort((rows.step, vehicle))
+    before, after = order[:-1], order[1:]
+    again = (vehicle[before] == vehicle[after]) & (rows.step[before] == rows.step[after])
+    before, after = before[again], after[again]
+    if not len(after):
+        return rows
+    differs = rows.texts["lane"][before] != rows.texts["lane"][after]
+    for name in _NUMBERS:
+        values = rows.numbers[name]
+        both_empty = np.isnan(values[before]) & np.isnan(values[after])
+        differs |= (values[before] != values[after]) & ~both_empty
+    if differs.any():
+        raise DataError(
+            f"{_where(rows, int(after[differs][0]))}: the vehicle has two different rows"
+            f" ({int(differs.sum())} such pairs of rows); keep one of them"
+        )
+    kept = np.ones(len(rows.step), dtype=bool)
+    kept[after] = False
+    dropped = tracks.count_reasons({"the same row again": ~kept}, "rows")
+    return replace(
+        rows,
+        step=rows.step[kept],
+        numbers={name: values[kept] for name, values in rows.numbers.items()},
+        texts={name: values[kept] for name, values in rows.texts.items()},
+        dropped=(*rows.dropped, *dropped),
+    )
 
 
 # --- XML ------------------------------------------------------------------------------------------
