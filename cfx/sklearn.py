@@ -150,7 +150,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         context, last = self._prepared(pairs)
         members = torch.ones((1, len(context.pairs)), dtype=torch.bool)
         with visit():
-            found = context.calibrator.population(context.pairs, context.batch, last, members)
+            found = context.calibrator.pooled(context.pairs, context.batch, last, members)
         return pd.Series(found[0].tolist(), index=list(context.space.names))
 
     def __sklearn_tags__(self) -> Tags:

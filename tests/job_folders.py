@@ -20,8 +20,8 @@ from cfx.evaluation.tables import values_of
 from cfx.results.tables import history_metrics
 from tests.made_up import GAINS, TWO, info, make_history, make_platoon, make_results, with_metric
 
-WITHIN = ("default", "fixed", "policy")
-ACROSS = ("default", "population", "fixed", "policy")
+WITHIN = ("default", "driver_specific", "policy")
+ACROSS = ("default", "pooled", "driver_specific", "policy")
 
 
 def write_job(
@@ -66,7 +66,7 @@ def write_job(
         "optimizer": {"name": "random"},
         "learner": {"name": "imitation", "epochs": 12, "batch_size": 16},
         "protocol": {"name": "across_drivers", "folds": 5}
-        if "population" in methods
+        if "pooled" in methods
         else {"name": "within_driver"},
         "seed": 0,
         "split": 0.8,
@@ -118,7 +118,7 @@ def _with_further_results(evaluation: Evaluation) -> Evaluation:
         if metric == "jerk":
             by_method["real"] = 0.4
         evaluation = with_metric(evaluation, metric, by_method, summary=summary)
-    unseen = [method for method in methods if method != "fixed"]
+    unseen = [method for method in methods if method != "driver_specific"]
     if "full_trajectory" in evaluation.improvements:
         for metric, value in {"collisions": 0.0, "hard_braking": 2.0}.items():
             by_method = dict.fromkeys(unseen, value)
@@ -138,13 +138,13 @@ def _completed(evaluation: Evaluation, methods: Sequence[str], cluster: str) -> 
     else:
         about["cluster"] = cluster
     speeds = values_of(evaluation.values, "rmse_speed", "test")
-    whole = "population" in methods
+    whole = "pooled" in methods
     improvements, improvements_whole = {}, {}
     for baseline in methods:
         if baseline == "policy":
             continue
         improvements[baseline] = _statistics(speeds[baseline], speeds["policy"])
-        if whole and baseline != "fixed":
+        if whole and baseline != "driver_specific":
             improvements_whole[baseline] = _statistics(
                 1.3 * speeds[baseline], 1.1 * speeds["policy"]
             )
@@ -166,8 +166,8 @@ def _completed(evaluation: Evaluation, methods: Sequence[str], cluster: str) -> 
 
 
 def _full_trajectory(values: pd.DataFrame) -> pd.DataFrame:
-    """Returns errors over full trajectories: somewhat larger; none of `fixed`."""
-    factors = {"default": 1.3, "population": 1.3, "policy": 1.1}
+    """Returns errors over full trajectories: somewhat larger; none of `driver_specific`."""
+    factors = {"default": 1.3, "pooled": 1.3, "policy": 1.1}
     errors = values["metric"].isin(["rmse_speed", "rmse_gap"]) & values["method"].isin(factors)
     found = values[errors].assign(scope="full_trajectory")
     found["value"] *= found["method"].map(factors)

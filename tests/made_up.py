@@ -44,7 +44,7 @@ def make_results(
     seed: int = 0,
     epochs: int = 60,
     networks: int | None = None,
-    methods: tuple[str, ...] = ("default", "fixed", "policy"),
+    methods: tuple[str, ...] = ("default", "driver_specific", "policy"),
 ) -> MadeUp:
     """Makes up an evaluation, a style and learning curves (one network per pair by default)."""
     rng = np.random.default_rng(seed)
@@ -79,7 +79,7 @@ def make_trajectory(
     frames: int,
     space: ParameterSpace,
     rng: np.random.Generator,
-    methods: tuple[str, ...] = ("default", "fixed", "policy"),
+    methods: tuple[str, ...] = ("default", "driver_specific", "policy"),
 ) -> PairTrajectory:
     low, high = np.array([p.low for p in space.tuned]), np.array([p.high for p in space.tuned])
     time = 56.0 + 0.1 * np.arange(frames + 1)
@@ -89,7 +89,7 @@ def make_trajectory(
     real_gap = 12 + 2 * (k % 4) + 0.1 * np.cumsum(leader - real)
     size = {
         "default": 2.6 * (1 + k % 3),
-        "fixed": 0.9 * rng.uniform(0.6, 1.4),
+        "driver_specific": 0.9 * rng.uniform(0.6, 1.4),
         "policy": 0.75 * rng.uniform(0.5, 1.6),
     }
     size = {method: size.get(method, 1.3) for method in methods}
@@ -101,9 +101,9 @@ def make_trajectory(
     wander = np.cumsum(rng.normal(0, 0.012, (windows[-1] + 1, len(low))), axis=0)[windows]
     parameters = {
         "default": np.tile([p.default for p in space.tuned], (frames + 1, 1)),
-        "fixed": np.tile(best, (frames + 1, 1)),
+        "driver_specific": np.tile(best, (frames + 1, 1)),
         "policy": np.clip(best + wander * (high - low), low, high),
-        "population": np.tile(low + 0.3 * (high - low), (frames + 1, 1)),
+        "pooled": np.tile(low + 0.3 * (high - low), (frames + 1, 1)),
         "shrunk": np.tile(low + 0.4 * (high - low), (frames + 1, 1)),
     }
     parameters = {method: parameters[method] for method in methods}
@@ -187,10 +187,10 @@ FORECAST_METHODS = (
     "constant_speed",
     "constant_acceleration",
     "default",
-    "population",
-    "population_residual",
-    "fixed",
-    "fixed_residual",
+    "pooled",
+    "pooled_residual",
+    "driver_specific",
+    "driver_specific_residual",
     "policy",
 )
 FORECAST_COLUMNS = (
@@ -239,7 +239,7 @@ def make_distributions(forecasts: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
     """Scores of the same origins: the policy's paths are a third better than its centre."""
     rng = np.random.default_rng(seed)
     parts = []
-    for method, share in (("population_ar", 1.2), ("fixed_ar", 1.1), ("policy", 0.67)):
+    for method, share in (("pooled_ar", 1.2), ("driver_specific_ar", 1.1), ("policy", 0.67)):
         rows = forecasts[forecasts["method"] == "policy"]
         scores = dict.fromkeys(DISTRIBUTION_COLUMNS[4:], share * rows["ade"])
         scores["crps_speed"] = share * rows["speed_error"].abs()
@@ -247,15 +247,15 @@ def make_distributions(forecasts: pd.DataFrame, seed: int = 0) -> pd.DataFrame:
         scores["pit"] = rng.beta(0.8, 0.8, len(rows))
         part = rows[["pair_id", "driver", "horizon_s"]].assign(method=method, **scores)
         parts.append(part[list(DISTRIBUTION_COLUMNS)])
-    centre = parts[0].assign(method="fixed", coverage=np.nan, pit=np.nan)
+    centre = parts[0].assign(method="driver_specific", coverage=np.nan, pit=np.nan)
     return pd.concat([*parts, centre], ignore_index=True)
 
 
 GAINS = {
-    ("own", "0 s"): -0.1,
-    ("own", "10 s"): 0.1,
-    ("own", "80 %"): 0.2,
-    ("population", "80 %"): 0.05,
+    ("driver_specific", "0 s"): -0.1,
+    ("driver_specific", "10 s"): 0.1,
+    ("driver_specific", "80 %"): 0.2,
+    ("pooled", "80 %"): 0.05,
 }
 
 

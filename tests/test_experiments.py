@@ -89,7 +89,7 @@ def test_an_experiment_sweeps_without_being_told(
     for folder in summary["folder"]:
         job = tmp_path / "out" / folder
         assert yaml.safe_load((job / "config.yaml").read_text())["preset"] == "paper/clusters"
-        assert "rmse_improvement/population/geometric" in json.loads(
+        assert "improvement/rmse_speed/pooled/geometric" in json.loads(
             (job / "metrics.json").read_text()
         )
 
@@ -101,5 +101,5 @@ def test_one_pair_has_its_table_and_its_speed_plots(
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.touch())
     few = ["data.frames=120", "tracking.enabled=false", "figures=own"]
     result = cfx.run(["experiment=paper/pair", *SMALL, *few])
-    assert result.pairs.method.tolist() == ["default", "fixed", "policy"]
+    assert result.pairs.method.tolist() == ["default", "driver_specific", "policy"]
     assert "speeds.png" in {path.name for path in result.figures}

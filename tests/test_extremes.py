@@ -111,13 +111,13 @@ def test_the_edges_of_what_is_recorded(
     assert code == 0, err
     assert "nan" not in out
     metrics = json.loads((folder / "metrics.json").read_text())
-    for method in ("default", "fixed", "policy"):
+    for method in ("default", "driver_specific", "policy"):
         for name in ("rmse_speed", "rmse_gap", "collisions", "jerk"):
             assert np.isfinite(metrics[f"{name}/{method}"]), name
     # What has no value is null, and only where a value makes no sense.
     undefined = {name.split("/")[0] for name, value in metrics.items() if value is None}
-    assert undefined <= {"nrmse_speed", "theil_u", "min_ttc", "rmse_improvement", "steady"}
-    if metrics["rmse_improvement/geometric"] is None:
+    assert undefined <= {"nrmse_speed", "theil_u", "min_ttc", "improvement", "steady"}
+    if metrics["improvement/rmse_speed/driver_specific/geometric"] is None:
         assert "Over driver-specific: 3 of 3 pairs have no improvement" in out
 
 
@@ -131,7 +131,7 @@ def test_the_precision_is_no_part_of_the_result(tmp_path: Path) -> None:
         job = [*JOB, f"data.path={path}", f"dtype={dtype}"]
         assert cli.main([*job, f"hydra.run.dir={folder}"]) == 0
         found[dtype] = json.loads((folder / "metrics.json").read_text())
-    for method in ("default", "fixed"):
+    for method in ("default", "driver_specific"):
         for name in ("rmse_speed", "rmse_gap"):
             single, double = (found[one][f"{name}/{method}"] for one in found)
             assert single == pytest.approx(double, rel=1e-3)

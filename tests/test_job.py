@@ -93,10 +93,10 @@ def test_the_folder_holds_what_the_contract_says(finished: cfx.plugin.Result) ->
     expected = {
         f"{what}/{method}"
         for what in ("rmse_speed", "rmse_gap")
-        for method in ("default", "fixed", "policy")
+        for method in ("default", "driver_specific", "policy")
     }
     expected |= {
-        f"rmse_improvement/{name}"
+        f"improvement/rmse_speed/driver_specific/{name}"
         for name in (
             "geometric",
             "ratio_of_means",
@@ -133,7 +133,7 @@ def test_the_terminal_says_what_matters(finished: cfx.plugin.Result) -> None:
 def test_a_row_per_pair_and_method(finished: cfx.plugin.Result) -> None:
     assert len(finished.pairs) == 9
     means = finished.pairs.groupby("method").rmse_speed.mean()
-    for method in ("default", "fixed", "policy"):
+    for method in ("default", "driver_specific", "policy"):
         assert finished.metrics[f"rmse_speed/{method}"] == pytest.approx(means[method])
 
 
@@ -157,7 +157,7 @@ def test_a_calibration_says_its_objective_and_reports_the_others(
         if entry.distribution != "cfx-driving":
             continue
         name = entry.name
-        assert finished.metrics[f"calibration/{name}/fixed"] >= 0, name
+        assert finished.metrics[f"calibration/{name}/driver_specific"] >= 0, name
 
 
 def test_another_objective_calibrates_other_parameters() -> None:
@@ -165,7 +165,7 @@ def test_another_objective_calibrates_other_parameters() -> None:
     speed = run(*search, "objective=speed_rmse")
     gap = run(*search, "objective=gap_rmse")
     for name, better, worse in (("speed_rmse", speed, gap), ("gap_rmse", gap, speed)):
-        metric = f"calibration/{name}/fixed"
+        metric = f"calibration/{name}/driver_specific"
         assert better.metrics[metric] < worse.metrics[metric], name
 
 
@@ -192,8 +192,8 @@ def test_the_policy_in_mlflow_predicts_the_same(
     assert experiment is not None
     (tracked,) = client.search_runs([experiment.experiment_id])
     assert tracked.info.status == "FINISHED"
-    assert tracked.data.metrics["rmse_speed/fixed"] == pytest.approx(
-        finished.metrics["rmse_speed/fixed"]
+    assert tracked.data.metrics["rmse_speed/driver_specific"] == pytest.approx(
+        finished.metrics["rmse_speed/driver_specific"]
     )
     assert tracked.data.params["model.name"] == "krauss"
     before = mlflow.get_tracking_uri()
@@ -219,7 +219,7 @@ def test_other_components_run_too(overrides: list[str]) -> None:
     result = run(*overrides)
     assert all(
         math.isfinite(result.metrics[f"rmse_speed/{method}"])
-        for method in ("default", "fixed", "policy")
+        for method in ("default", "driver_specific", "policy")
     )
     loaded = cfx.load(result.folder)
     table = pd.read_parquet(result.folder / "data.parquet")
@@ -454,6 +454,6 @@ def test_a_calibration_has_one_number_and_no_policy_that_repeats_another_method(
     result = run("policy=fixed", *few)
     assert "policy" not in set(result.pairs["method"])
     assert not [name for name in result.metrics if name.endswith("/policy") or "improve" in name]
-    own = f"driver-specific {result.metrics['rmse_speed/fixed']:.3f} m/s"
+    own = f"driver-specific {result.metrics['rmse_speed/driver_specific']:.3f} m/s"
     said = [capsys.readouterr().out, repr(result), repr(cfx.load(result.folder))]
     assert all(f"calibration; {own}" in one for one in said)

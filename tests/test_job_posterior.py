@@ -31,7 +31,12 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_intervals_that_are_not_to_be_relied_on_are_named() -> None:
-    fits = {"pair_id": ["a", "b"], "method": "fixed", "noise_scale": 0.1, "noise_left": 0.0}
+    fits = {
+        "pair_id": ["a", "b"],
+        "method": "driver_specific",
+        "noise_scale": 0.1,
+        "noise_left": 0.0,
+    }
     rows = pd.DataFrame({**fits, "pareto_k": [0.3, 0.8], "effective_samples": [60.0, 20.0]})
     known = KnownParameters(rows, ())
     assert known.metrics()["posterior/reliable"] == 0.5
@@ -77,8 +82,12 @@ def test_a_posterior_of_a_third_party_needs_a_class_and_an_entry_point(install: 
     point = {"cfx.posteriors": {"certain": "certain_posterior:CertainMethod"}}
     install("somebody-else", point, {"certain_posterior.py": CERTAIN})
     found = cfx.run([*QUICK, "hydra.run.dir=job", "calibration.posterior=certain"])
-    rows = pd.read_parquet("job/fits.parquet").query("method == 'fixed'").set_index("pair_id")
-    fixed = found.pairs.query("method == 'fixed'").set_index("pair_id")
+    rows = (
+        pd.read_parquet("job/fits.parquet")
+        .query("method == 'driver_specific'")
+        .set_index("pair_id")
+    )
+    fixed = found.pairs.query("method == 'driver_specific'").set_index("pair_id")
     for name in found.evaluation.names:
         assert found.metrics[f"posterior/determined/{name}"] == 1
         expected = fixed[f"parameter_{name}"]

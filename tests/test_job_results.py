@@ -47,8 +47,8 @@ def test_an_odd_folder_is_printed_as_it_is() -> None:
 
 
 def test_a_safe_drive_is_not_talked_about() -> None:
-    nothing = dict.fromkeys(("default", "fixed", "policy"), 0)
-    text = said(measured(nothing, {"default": 0.0, "fixed": 0.3, "policy": 0.004}))
+    nothing = dict.fromkeys(("default", "driver_specific", "policy"), 0)
+    text = said(measured(nothing, {"default": 0.0, "driver_specific": 0.3, "policy": 0.004}))
     assert "-8 m/s2" not in text
     assert "bounds" not in text
 
@@ -56,7 +56,8 @@ def test_a_safe_drive_is_not_talked_about() -> None:
 def test_hard_braking_and_parameters_at_bounds_are_told() -> None:
     text = said(
         measured(
-            {"default": 0, "fixed": 1, "policy": 2}, {"default": 0.0, "fixed": 0.25, "policy": 0.5}
+            {"default": 0, "driver_specific": 1, "policy": 2},
+            {"default": 0.0, "driver_specific": 0.25, "policy": 0.5},
         )
     )
     assert "Frames with an acceleration below -8 m/s2: driver-specific 4, policy 8." in text
@@ -66,7 +67,7 @@ def test_hard_braking_and_parameters_at_bounds_are_told() -> None:
 def test_parameters_that_recordings_do_not_determine_are_told() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
     about, name = evaluation.about, evaluation.names[0]
-    fixed = about["method"] == "fixed"
+    fixed = about["method"] == "driver_specific"
     shares = pd.Series([1.0, 1.0, 0.95, 1.0], index=about.index[fixed])
     flat = dataclasses.replace(evaluation, about=about.assign(**{f"flat_{name}": shares}))
     assert f"Not determined: {name} for 3 of 4 pairs" in said(flat)
@@ -119,14 +120,17 @@ def row(text: str, over: str) -> list[str]:
 
 
 def test_improvements_are_a_table_in_percent_that_fits_80_columns() -> None:
-    gains = {"fixed": improvement(), "population": improvement(geometric=-0.05, win_rate=0.25)}
+    gains = {
+        "driver_specific": improvement(),
+        "pooled": improvement(geometric=-0.05, win_rate=0.25),
+    }
     evaluation = make_results(pairs=4, frames=20).evaluation
     evaluation = dataclasses.replace(
         evaluation,
         improvements={
             "test": gains,
-            "steady": {"fixed": improvement()},
-            "full_trajectory": {"population": improvement()},
+            "steady": {"driver_specific": improvement()},
+            "full_trajectory": {"pooled": improvement()},
         },
     )
     text = said(evaluation, width=80)
@@ -144,8 +148,8 @@ def test_improvements_are_a_table_in_percent_that_fits_80_columns() -> None:
 def test_few_drivers_and_undefined_improvements_are_said() -> None:
     nan = float("nan")
     text = compared(
-        fixed=improvement(pairs=1, drivers=1, ci95_low=nan, ci95_high=nan, p_value=nan),
-        population=improvement(pairs=0, drivers=0, undefined=4),
+        driver_specific=improvement(pairs=1, drivers=1, ci95_low=nan, ci95_high=nan, p_value=nan),
+        pooled=improvement(pairs=0, drivers=0, undefined=4),
     )
     assert row(text, "driver-specific")[2:] == ["one driver", "+42.1", "1 of 1", ""]
     assert row(text, "pooled")[1] == "not defined"

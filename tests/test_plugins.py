@@ -266,7 +266,7 @@ def test_a_name_of_cfxs_own_always_means_cfxs_own(
     assert registry.get("model", "krauss").__module__ == "cfx.models.krauss"
     result = application.run(QUICK)
     metrics = json.loads((result.folder / "metrics.json").read_text(encoding="utf-8"))
-    assert metrics["rmse_speed/fixed"] > 0
+    assert metrics["rmse_speed/driver_specific"] > 0
     with pytest.raises(
         PluginError,
         match=r"two distributions bring a model 'twin': twin-one 1\.0 .* and twin-two 2\.0",

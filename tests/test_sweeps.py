@@ -52,12 +52,12 @@ JOB = """
             Path(f"waits-{config.seed}").touch()
             time.sleep(0.02)
         metrics = {f"rmse_speed/{method}": value + config.seed for method, value in
-                   (("default", 1.0), ("fixed", 0.5), ("policy", 0.25))}
-        metrics |= {"rmse_improvement/geometric": 0.5, "rmse_improvement/ci95_low": 0.25,
-                    "rmse_improvement/ci95_high": None}
+                   (("default", 1.0), ("driver_specific", 0.5), ("policy", 0.25))}
+        metrics |= {"improvement/rmse_speed/driver_specific/geometric": 0.5, "improvement/rmse_speed/driver_specific/ci95_low": 0.25,
+                    "improvement/rmse_speed/driver_specific/ci95_high": None}
         if config.model["name"] == "w99":
             for name in ("mean", "ci95_low", "ci95_high"):
-                metrics[f"rmse_improvement/population/{name}"] = 0.125
+                metrics[f"improvement/rmse_speed/pooled/{name}"] = 0.125
         (folder / "metrics.json").write_text(json.dumps(metrics))
         (folder / "told").write_text(f"{config.tracking.sweep} {os.environ.get('OMP_NUM_THREADS')}")
         return Result(metrics)
@@ -330,7 +330,12 @@ def test_the_summary_compares_jobs_by_what_differs(run: Run, capsys) -> None:
         ("2", "w99", "failed"),
     ]
     assert "split" not in table[0]
-    assert [row["improvement_over"] for row in table] == ["fixed", "fixed", "", ""]
+    assert [row["improvement_over"] for row in table] == [
+        "driver_specific",
+        "driver_specific",
+        "",
+        "",
+    ]
     assert [row["improvement_geometric"] for row in table] == ["0.5", "0.5", "", ""]
     assert [row["improvement_ci95_high"] for row in table] == ["", "", "", ""]
     assert [row["rmse_speed_policy"] for row in table] == ["0.25", "0.25", "", ""]

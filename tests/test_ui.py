@@ -64,13 +64,13 @@ def fill(store: str) -> str:
             run.log_metrics(
                 {
                     "improvement_percent": round(100 * improvement, 1),
-                    "rmse_improvement/geometric": improvement,
+                    "improvement/rmse_speed/driver_specific/geometric": improvement,
                     "rmse_speed/policy": 1.5,
-                    "rmse_speed/fixed": 1.75,
+                    "rmse_speed/driver_specific": 1.75,
                 }
             )
     with MlflowTracker.run(store, run_name="a single job", parameters={"seed": "7"}) as run:
-        run.log_metrics({"rmse_improvement/geometric": 0.3})
+        run.log_metrics({"improvement/rmse_speed/driver_specific/geometric": 0.3})
     with MlflowTracker.run(store, run_name="killed", parameters={}) as run:
         pass
     # What a killed process leaves: a run that says RUNNING, and by which process, long gone.
@@ -87,7 +87,7 @@ def fill(store: str) -> str:
 
 def a_run(model: str, seed: int, improvement: float) -> SimpleNamespace:
     """Returns a job's run as MLflow gives it."""
-    metrics = {"rmse_improvement/geometric": improvement}
+    metrics = {"improvement/rmse_speed/driver_specific/geometric": improvement}
     data = SimpleNamespace(params={"model.name": model, "seed": str(seed)}, metrics=metrics)
     return SimpleNamespace(data=data, info=SimpleNamespace(status="FINISHED"))
 
@@ -228,5 +228,5 @@ def test_a_browser_compares_a_sweeps_jobs_and_shows_all_jobs(
         "killed",
     ]
     page.goto(served.link("page", "job a single"))
-    page.get_by_text("rmse_improvement/geometric").first.wait_for()
+    page.get_by_text("improvement/rmse_speed/driver_specific/geometric").first.wait_for()
     assert browser.outside() == []

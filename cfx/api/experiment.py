@@ -148,8 +148,8 @@ def train(
         >>> small |= {"optimizer": "random", "optimizer.samples": 64}
         >>> result = cfx.train(pairs, "idm", **small)
         >>> sorted(result.pairs["method"].unique())
-        ['default', 'fixed', 'policy', 'population']
-        >>> result.improvement(over="population").index[0]
+        ['default', 'driver_specific', 'policy', 'pooled']
+        >>> result.improvement(over="pooled").index[0]
         'geometric'
     """
     return config(pairs_from(pairs), experiment=for_, model=model, seed=seed, **settings).run()

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from cfx.calibration.posterior import DriverPosteriors
     from cfx.evaluation.protocols.base import ProtocolContext
 
-METHODS = ("default", "population", "fixed")
+METHODS = ("default", "pooled", "driver_specific")
 """What is compared: the model's defaults, pooled and driver-specific parameters."""
 
 _AT_BOUND = 0.01
@@ -70,7 +70,7 @@ class Fit:
         members = torch.ones((1, len(self.pairs)), dtype=torch.bool)
         context = self._context
         with visit():
-            found = context.calibrator.population(context.pairs, context.batch, self._last, members)
+            found = context.calibrator.pooled(context.pairs, context.batch, self._last, members)
         return pd.Series(found[0].tolist(), index=self.parameters.columns, name="pooled")
 
     @property
@@ -86,7 +86,7 @@ class Fit:
         `train_rmse_speed` (m/s) and `train_rmse_gap` (m) are of the part that was calibrated on,
         `test_...` of the rest, simulated in closed loop from the last measured state before it;
         with `split=1` there is no rest.
-        `method` is `default`, `population` (pooled) or `fixed` (driver-specific).
+        `method` is `default`, `pooled` or `driver_specific`.
         """
         with visit():
             return pd.concat([self._errors(method) for method in METHODS], ignore_index=True)
@@ -167,7 +167,7 @@ class Fit:
         if settings.posterior == "none":
             raise ConfigError(f"there is no posterior; {_ask_for('laplace')}")
         with visit():
-            own, solver = self._tensor("fixed"), context.calibrator.solver
+            own, solver = self._tensor("driver_specific"), context.calibrator.solver
             method = posterior_method(settings.posterior)
             return method.find(solver, context.batch, self._last, own, settings)
 
@@ -182,9 +182,9 @@ class Fit:
 
     def _of(self, method: str) -> pd.DataFrame:
         """Returns a method's parameters, a row per pair."""
-        if method == "fixed":
+        if method == "driver_specific":
             return self.parameters
-        same = self.pooled if method == "population" else self.defaults
+        same = self.pooled if method == "pooled" else self.defaults
         rows = np.tile(same.to_numpy(dtype=np.float64), (len(self.parameters), 1))
         return pd.DataFrame(rows, self.parameters.index, self.parameters.columns)
 
@@ -294,7 +294,7 @@ def calibrate(
         _, components, context = steps.without_files(experiment.config, recording.selected)
         with closing(components.engine):
             last = Split.of(context.pairs, context.windows, context.split).frame
-            found = context.calibrator.fixed(context.pairs, context.batch, last)
+            found = context.calibrator.driver_specific(context.pairs, context.batch, last)
     ids = pd.Index(context.pairs.ids, name="pair_id")
     table = pd.DataFrame(found.cpu().numpy(), ids, list(context.space.names))
     return Fit(experiment, recording, table, context, last)

@@ -148,7 +148,9 @@ def forecast(
             generators.append(torch.Generator().manual_seed(seed * 1_000_003 + number))
         base = None  # what the agent brings
         if agent.base is not None and agent.context_rule.driver_specific:
-            calibrated = context.calibrator.fixed(context.pairs, context.batch, origins.frame.cpu())
+            calibrated = context.calibrator.driver_specific(
+                context.pairs, context.batch, origins.frame.cpu()
+            )
             base = base_of(agent, calibrated)[:, : calibrated.shape[1]]
         network = torch.zeros_like(origins.pair)
         followers = Followers(context.batch, network, base, agent.context_rule.history_s)

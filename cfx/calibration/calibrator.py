@@ -150,7 +150,7 @@ class Calibrator:
             return self.solver.objective.tie_tolerance
         return settings.tie_tolerance
 
-    def fixed(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> Tensor:
+    def driver_specific(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> Tensor:
         """Finds one parameter set per pair: the driver-specific parameters.
 
         Args:
@@ -167,7 +167,9 @@ class Calibrator:
         last = last.to(device)
         keys = []
         for pair, end in zip(pairs, last.tolist(), strict=True):
-            keys.append(self._key("fixed", pair.fingerprint, frames=end, **self._prior_key))
+            keys.append(
+                self._key("driver_specific", pair.fingerprint, frames=end, **self._prior_key)
+            )
 
         compiled = self._has_kernel(batch)
 
@@ -189,7 +191,7 @@ class Calibrator:
         results = self._cached(title, keys, sizes, shard, at_most=_TRAJECTORIES_OF_SHARD)
         return _stacked(results, requested_device)
 
-    def population(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
+    def pooled(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
         """Finds one parameter set for each of K groups of pairs: the pooled parameters.
 
         Their loss is the mean of their pairs' losses: see `PooledLosses`.
@@ -209,7 +211,7 @@ class Calibrator:
         keys = []
         for row in members:
             group = _group_key(pairs, last, row)
-            keys.append(self._key("population", "", pairs=group, **self._prior_key))
+            keys.append(self._key("pooled", "", pairs=group, **self._prior_key))
 
         compiled = self._has_kernel(batch)
 
@@ -249,7 +251,7 @@ class Calibrator:
         for number, (pair, count, row) in enumerate(rows):
             for first in range(0, count, _WINDOWS_OF_ENTRY):
                 size = min(_WINDOWS_OF_ENTRY, count - first)
-                which = {"first": first, "windows": size, "fixed": row}
+                which = {"first": first, "windows": size, "driver_specific": row}
                 keys.append(self._key("labels", pair.fingerprint, **which, **description))
                 owner.append(number)
                 begin.append(first)

@@ -147,13 +147,14 @@ def with_flat_shares(
 ) -> pd.DataFrame:
     """Returns a table of pairs and methods with a column `flat_NAME` for each parameter.
 
-    It holds the flat shares of the method `fixed`, whose parameters they are of; else NaN.
+    It holds the flat shares of the method `driver_specific`, whose parameters they are of; else
+    NaN.
     """
     shares = flat_shares(slices)
     columns = {}
     for name in names:
         values = about["pair_id"].map(shares[name])
-        columns[f"{FLAT_SHARE_PREFIX}{name}"] = values.where(about["method"] == "fixed")
+        columns[f"{FLAT_SHARE_PREFIX}{name}"] = values.where(about["method"] == "driver_specific")
     return about.assign(**columns)
 
 

@@ -173,9 +173,9 @@ def evaluate(
 
     Args:
         tested: P pairs.
-        scopes: the closed loops of each method of `METHODS`. `test`: from `first` on; `fixed` and
-            `policy` are among them. `full_trajectory`, if there: from frame 0 on, of methods that
-            nothing of these drivers went into.
+        scopes: the closed loops of each method of `METHODS`. `test`: from `first` on;
+            `driver_specific` and `policy` are among them. `full_trajectory`, if there: from frame 0
+            on, of methods that nothing of these drivers went into.
         space: the model's parameters, in the bounds of constant ones.
         policy_space: the parameters in the bounds of `policy`; None: the same bounds.
         metrics: what is measured; None: cfx's own metrics.

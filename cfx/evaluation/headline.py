@@ -24,17 +24,14 @@ SPEED_ERROR = "rmse_speed_mps"
 _JUDGED = {"rmse_gap_m": "rmse_gap", "collisions": "collisions"}
 """Further metrics of the method that a job is judged by."""
 
-_CONSTANT = {"fixed": "driver-specific", "population": "pooled", "default": "default"}
+_CONSTANT = {"driver_specific": "driver-specific", "pooled": "pooled", "default": "default"}
 """Constant parameters, the first of which is a calibration's number."""
 
 
 def improvement_key(baseline: str, scope: str = "test") -> str:
     """Returns how the metrics of the improvement over a baseline begin."""
-    if scope != "test":
-        return f"{scope}/rmse_improvement/{baseline}"
-    if baseline == "fixed":
-        return "rmse_improvement"
-    return f"rmse_improvement/{baseline}"
+    key = f"improvement/rmse_speed/{baseline}"
+    return key if scope == "test" else f"{scope}/{key}"
 
 
 class Comparison(NamedTuple):
@@ -50,9 +47,9 @@ class Comparison(NamedTuple):
 
 
 _COMPARISONS = (
-    Comparison("fixed", "test"),
-    Comparison("population", "full_trajectory"),
-    Comparison("population", "test"),
+    Comparison("driver_specific", "test"),
+    Comparison("pooled", "full_trajectory"),
+    Comparison("pooled", "test"),
 )
 """The first that was measured counts."""
 
@@ -106,7 +103,7 @@ def doubts(metrics: Mapping[str, float], compared: Comparison) -> list[str]:
 
 
 def main_error(metrics: Mapping[str, float]) -> float:
-    """Returns the RMSE of speed that a job is judged by: the policy's; of a calibration `fixed`."""
+    """Returns the RMSE of speed of the method that a job is judged by."""
     for method in ("policy", *_CONSTANT):
         error = metrics.get(key_of("rmse_speed", method), math.nan)
         if math.isfinite(error):

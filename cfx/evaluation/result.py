@@ -40,17 +40,17 @@ _ROWS_AT_ONCE = 1 << 17
 FORECAST = "forecast"
 """The scope of forecasts in the long table, and what their metrics begin with."""
 
-METHODS = ("default", "population", "fixed", "shrunk", "policy")
+METHODS = ("default", "pooled", "driver_specific", "shrunk", "policy")
 """What an evaluation may compare, in the order in which it is shown.
 
 All start from the same measured state and are compared on the same frames.
 
 `default`: the model's default parameters.
-`population`: one set, calibrated jointly on the training drivers (pooled calibration), none of whom
+`pooled`: one set, calibrated jointly on the training drivers (pooled calibration), none of whom
 is tested.
-`fixed`: the driver's own set, calibrated on the first part of the trajectory.
+`driver_specific`: the driver's own set, calibrated on the first part of the trajectory.
 `shrunk`: that set shrunk towards the default and kept constant. A policy of offsets starts from it
-where it is not `fixed` itself; it separates what adapting adds from what shrinking does.
+where it is not `driver_specific` itself; it separates what adapting adds from what shrinking does.
 `policy`: parameters that a policy chooses for each window.
 """
 
@@ -166,15 +166,15 @@ class Evaluation:
             the simulation still comes from the measured state; `full_trajectory/METRIC/METHOD`:
             from the first frame on, where that was simulated. `measured` says what each is, its
             unit, and how the pairs become one number. `METRIC/real`: the recorded drivers'.
-        `rmse_improvement/STATISTIC`, `rmse_improvement/BASELINE/STATISTIC`: see `Improvement`;
-            against `fixed` unless named; `steady/...` and `full_trajectory/...` as above.
+        `improvement/rmse_speed/BASELINE/STATISTIC`: see `Improvement`; `steady/...` and
+            `full_trajectory/...` as above.
     Further tables bring metrics of their own (`cfx.results.table`).
 
     Attributes:
         about: a row per pair and method: pair_id, recording, leader_id, follower_id, driver,
             cluster, style_score, fold, method, frames (that count), and a column `parameter_NAME`
-            with the mean of each tuned parameter over them; of `fixed` also `flat_NAME`, on which
-            share of its range the loss is flat, where that was asked.
+            with the mean of each tuned parameter over them; of `driver_specific` also `flat_NAME`,
+            on which share of its range the loss is flat, where that was asked.
         values: a row per pair, method, scope and metric; see `cfx.evaluation.tables`.
         measured: the metrics, in the order in which they are shown.
         improvements: statistics of the policy's improvement, by scope (`test`; `steady`, after the

@@ -16,7 +16,7 @@ from cfx.evaluation.tables import values_of
 ALL_SITES = "all"
 """What the row is called in which each site counts once, and a row of all types of drivers."""
 
-BASELINES = ("fixed", "population")
+BASELINES = ("driver_specific", "pooled")
 """What the policy is compared with in each row."""
 
 Floats = NDArray[np.float64]

@@ -108,7 +108,7 @@ def wide_table(
     """Returns a row per pair and method: what `about` says, and the metrics as columns.
 
     Columns besides those of `about`: METRIC, `steady_METRIC`, `full_trajectory_METRIC` and, of the
-    recorded driver, `real_METRIC`; `improvement` over `fixed` and `improvement_over_BASELINE`.
+    recorded driver, `real_METRIC`; `improvement_over_BASELINE`.
     """
     parameters = [name for name in about if str(name).startswith(("parameter_", FLAT_SHARE_PREFIX))]
     columns: dict[str, pd.Series] = {}
@@ -194,6 +194,5 @@ def _improvements(about: pd.DataFrame, values: pd.DataFrame) -> dict[str, pd.Ser
         if baseline == "policy":
             continue
         before = about["pair_id"].map(speed[baseline])
-        name = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
-        columns[name] = ((before - own) / before).where(before > 0)
+        columns[f"improvement_over_{baseline}"] = ((before - own) / before).where(before > 0)
     return dict(sorted(columns.items()))

@@ -111,20 +111,20 @@ Dash = Literal["solid"] | tuple[float, tuple[float, ...]]
 
 DASHES: dict[str, Dash] = {
     "default": (0, (1.2, 1.4)),
-    "population": (0, (6.0, 1.5, 1.2, 1.5)),
-    "fixed": (0, (5.0, 1.8)),
+    "pooled": (0, (6.0, 1.5, 1.2, 1.5)),
+    "driver_specific": (0, (5.0, 1.8)),
     "shrunk": (0, (8.0, 1.5, 1.2, 1.5, 1.2, 1.5)),
     "constant_speed": (0, (1.2, 1.4)),
     "constant_acceleration": (0, (5.0, 1.8)),
-    "population_residual": (0, (6.0, 1.5, 1.2, 1.5)),
-    "fixed_residual": (0, (5.0, 1.8)),
-    "population_ar": (0, (1.2, 1.4)),
-    "fixed_ar": (0, (1.2, 1.4)),
+    "pooled_residual": (0, (6.0, 1.5, 1.2, 1.5)),
+    "driver_specific_residual": (0, (5.0, 1.8)),
+    "pooled_ar": (0, (1.2, 1.4)),
+    "driver_specific_ar": (0, (1.2, 1.4)),
     "policy_sampled": (0, (1.2, 1.4)),
 }
 """Dashes of each method's line; the others are solid."""
 _WIDTHS = {"real": 1.8, "leader": 1.0, "policy": 1.8}
-_ORDER = ("leader", "default", "population", "fixed", "shrunk", "real", "policy")
+_ORDER = ("leader", "default", "pooled", "driver_specific", "shrunk", "real", "policy")
 """The real driver lies on top of leader and baselines, and below the policy compared with it."""
 
 HIDDEN = frozenset({"shrunk"})

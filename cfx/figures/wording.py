@@ -57,13 +57,13 @@ METHOD_TEXTS: dict[str, MethodText] = {
     "real": MethodText("real driver", "real", "the recorded drivers"),
     "leader": MethodText("leader", "leader", "the recorded leader"),
     "default": MethodText("default parameters", "default", "the model's default parameters"),
-    "population": MethodText(
+    "pooled": MethodText(
         "pooled calibration",
         "pooled",
         "pooled calibration, which is one set of parameters for all drivers, calibrated jointly"
         " on the training drivers",
     ),
-    "fixed": MethodText(
+    "driver_specific": MethodText(
         "driver-specific calibration",
         "driver-specific",
         "driver-specific calibration, which is one set of parameters for each driver, calibrated"
@@ -86,24 +86,24 @@ METHOD_TEXTS: dict[str, MethodText] = {
         "constant acceleration",
         "the driver goes on at the acceleration that they have",
     ),
-    "population_residual": MethodText(
+    "pooled_residual": MethodText(
         "pooled, with residual",
         "pooled + residual",
         "pooled calibration, which takes over from the acceleration at the origin within seconds",
     ),
-    "fixed_residual": MethodText(
+    "driver_specific_residual": MethodText(
         "driver-specific, with residual",
         "driver-specific + residual",
         "driver-specific calibration, which takes over from the acceleration at the origin within"
         " seconds",
     ),
-    "population_ar": MethodText(
+    "pooled_ar": MethodText(
         "pooled, with noise",
         "pooled + noise",
         "pooled calibration with auto-regressive noise on the acceleration, as measured on"
         " recorded drivers",
     ),
-    "fixed_ar": MethodText(
+    "driver_specific_ar": MethodText(
         "driver-specific, with noise",
         "driver-specific + noise",
         "driver-specific calibration with auto-regressive noise on the acceleration, as measured"

@@ -50,10 +50,10 @@ class TrainingPairs:
         index: which of the U recorded pairs each is, `(P,)` int64.
         split: where the training part of each ends.
         network: which network learns from each, `(P,)` int64.
-        fixed: the parameters that each pair's network starts from, `(P, n)`, SI units: the driver's
+        start: the parameters that each pair's network starts from, `(P, n)`, SI units: the driver's
             own calibrated set, or the pooled one where networks are for unseen drivers.
         base: the parameters that answers refer to for each driver whose history was observed, `(P,
-            n)`, SI units, while those in `fixed` serve unseen drivers; None where there are no
+            n)`, SI units, while those in `start` serve unseen drivers; None where there are no
             unseen drivers. Only learners of offsets read them.
         labels: per-window calibrated parameters of the training parts; None if the learner needs
             none.
@@ -64,7 +64,7 @@ class TrainingPairs:
     index: Tensor
     split: Split
     network: Tensor
-    fixed: Tensor
+    start: Tensor
     base: Tensor | None = None
     labels: WindowLabels | None = None
     drivers: tuple[str, ...] | None = None

@@ -106,13 +106,13 @@ class ImitationLearner(Learner):
 
         s, device = self.settings, training_data.device
         head = head_class(s.head).for_model(training_data.stepper.model, device)
-        space, names, fixed = head.space, training_data.names, training_data.pairs.fixed
+        space, names, started = head.space, training_data.names, training_data.pairs.start
         weighs = s.weight_by_sensitivity
         dataset = ImitationDataset.of(policy, training_data, head, s.validation, weighs=weighs)
         generator = torch.Generator().manual_seed(training_data.seed)
         default = space.to_unit(space.defaults()).float()
         grid = Grid(training_data.pairs.network.to(device), len(names))
-        pooled = grid.mean(space.to_unit(fixed)).float()
+        pooled = grid.mean(space.to_unit(started)).float()
         start = head.untrained_answer(pooled.cpu())
         network = policy.build(dataset.features.shape[-1], default, start, generator)
         curves = pd.DataFrame(columns=CURVE_COLUMNS)
@@ -131,7 +131,7 @@ class ImitationLearner(Learner):
             warn_of_nothing_learned(curves)
         base = None
         if head.needs_base:
-            base = space.from_unit(pooled.to(fixed.dtype))
+            base = space.from_unit(pooled.to(started.dtype))
         return TrainingResult(
             network=network.eval(),
             scaler=dataset.scaler,

@@ -93,7 +93,7 @@ class ImitationDataset(NamedTuple):
             weight = _sensitivity_weight(sensitivity, train)
         # Each pair is learned from with its base, and with the pooled one where that is another.
         rows, network = torch.arange(pairs, device=device), training_data.pairs.network.to(device)
-        pooled, driver_specific = training_data.pairs.fixed, training_data.pairs.base
+        pooled, driver_specific = training_data.pairs.start, training_data.pairs.base
         base = head.space.to_unit(pooled).float()
         has_both = driver_specific is not None and not torch.equal(driver_specific, pooled)
         if driver_specific is not None and has_both and head.needs_base:

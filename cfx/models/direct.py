@@ -23,9 +23,9 @@ class Direct(DrivingModel):
     behind a leader unlike those that the policy has learned from.
 
     With constant parameters it holds a constant acceleration, whatever its leader does. So its
-    `default`, `population` and `fixed` are no baselines and improvements over them mean nothing
-    (`has_constant_baseline = False`; reports leave them out). Compare its absolute RMSE with other
-    jobs' on the same data.
+    `default`, `pooled` and `driver_specific` are no baselines and improvements over them mean
+    nothing (`has_constant_baseline = False`; reports leave them out). Compare its absolute RMSE
+    with other jobs' on the same data.
     """
 
     reference = "longitudinal kinematics, forward Euler"

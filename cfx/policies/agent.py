@@ -113,7 +113,7 @@ class Agent:
         base: parameters that answers refer to for drivers without a base of their own, `(N, n)`, SI
             units; None where the head needs none.
         context_rule: how a driver's context is made.
-        population: pooled parameters calibrated on the drivers that each network learned from,
+        pooled: pooled parameters calibrated on the drivers that each network learned from,
             `(N, n)`, SI units; None if there are none.
         trained_on: what it learned from.
         valid_range: the situations that each network learned from; None if they are not known.
@@ -131,7 +131,7 @@ class Agent:
     names: tuple[str, ...]
     base: Tensor | None = None
     context_rule: ContextRule = field(default_factory=ContextRule)
-    population: Tensor | None = None
+    pooled: Tensor | None = None
     trained_on: TrainedOn = field(default_factory=TrainedOn)
     valid_range: ValidRange | None = None
     dispersion: Tensor | None = None
@@ -256,8 +256,8 @@ class Agent:
         """
         if base is not None:
             return base
-        if self.population is not None:
-            return self.core.head.completed(self.population[network].double())
+        if self.pooled is not None:
+            return self.core.head.completed(self.pooled[network].double())
         return self.space.defaults().double().expand(len(network), -1)
 
     def burn_in(
@@ -312,7 +312,7 @@ class Agent:
     def _each(self, change: Callable[[Tensor], Tensor]) -> Agent:
         """Returns the agent with each tensor of its networks, `(N, ...)`, changed alike."""
         changed: dict[str, Any] = {}
-        for name in ("base", "population", "dispersion"):
+        for name in ("base", "pooled", "dispersion"):
             value = getattr(self, name)
             if value is not None:
                 changed[name] = change(value)
@@ -351,10 +351,10 @@ class Agent:
         unit = self.core.head.unit_parameters(answer, state.base)
         fallback = state.base
         if fallback is None:
-            if self.population is None:
+            if self.pooled is None:
                 return unit
-            population = self.population[state.network].double()
-            fallback = self.space.to_unit(self.core.head.completed(population))
+            pooled = self.pooled[state.network].double()
+            fallback = self.space.to_unit(self.core.head.completed(pooled))
         weight = weight_of_answer(state.score)[:, None]
         return torch.where(weight < 1.0, blended(fallback, unit, weight), unit)
 

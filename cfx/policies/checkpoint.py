@@ -156,7 +156,7 @@ def _agent(
     signals, shape = len(RANGE_SIGNALS), (networks,)
     shapes = {
         "base": (*shape, len(head.space)),
-        "population": (*shape, len(head.model_space)),
+        "pooled": (*shape, len(head.model_space)),
         "dispersion": shape,
         f"{_RANGE}mean": (*shape, signals),
         f"{_RANGE}precision": (*shape, signals, signals),
@@ -189,7 +189,7 @@ def _agent(
             history_s=description.history,
             combines=description.combines,
         ),
-        population=weights.get("population"),
+        pooled=weights.get("pooled"),
         trained_on=TrainedOn(
             description.learned_from, description.recorded, description.expected_error
         ),
@@ -204,7 +204,7 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
         tensors[f"network.{name}"] = value.cpu()
     for name, value in agent.core.scaler.state_dict().items():
         tensors[f"scaler.{name}"] = value.cpu()
-    for name in ("base", "population", "dispersion"):
+    for name in ("base", "pooled", "dispersion"):
         value = getattr(agent, name)
         if value is not None:
             tensors[name] = value.cpu()

@@ -44,8 +44,10 @@ def read_result(origin: Origin) -> Result:
         pairs = folder / "pairs.csv"
         if "pairs" not in tables:
             raise DataError(f"{pairs} is missing; run the job again, or leave it out")
-        if not {"policy", "fixed"} & set(tables["pairs"]["method"]):
-            raise DataError(f"{pairs} is damaged: it has no row of the method 'policy' or 'fixed'")
+        if not {"policy", "driver_specific"} & set(tables["pairs"]["method"]):
+            raise DataError(
+                f"{pairs} is damaged: it has no row of the method 'policy' or 'driver_specific'"
+            )
     missing = []
     for table in installed():
         if table.component.always and table.name not in tables:

@@ -281,8 +281,11 @@ class Result:
 
     @property
     def judged(self) -> str:
-        """The method whose numbers the job is judged by: the policy; of a calibration `fixed`."""
-        for method in ("policy", "fixed", "population"):
+        """The method whose numbers the job is judged by: the policy; of a calibration its own.
+
+        That is driver-specific parameters, or pooled ones where there are no others.
+        """
+        for method in ("policy", "driver_specific", "pooled"):
             if method in self.shown_methods:
                 return method
         return "default"
@@ -295,7 +298,7 @@ class Result:
         if self.purpose is not Purpose.ADAPTATION:
             return ()
         baselines: list[str] = []
-        for method in ("fixed", *self.methods):
+        for method in ("driver_specific", *self.methods):
             was_compared = f"{improvement_key(method, scope)}/geometric" in self.metrics
             is_new = method not in {*baselines, "policy"}
             if was_compared and is_new and method in self.methods:
@@ -337,11 +340,11 @@ class Result:
             summaries[name, method, scope] = float(summary)
         return summaries
 
-    def improvement(self, over: str = "fixed", scope: str = _TEST) -> pd.Series:
+    def improvement(self, over: str = "driver_specific", scope: str = _TEST) -> pd.Series:
         """Returns the policy's improvement of the RMSE of speed over a baseline (0.1 is 10 %).
 
         Args:
-            over: the baseline: `fixed` (driver-specific), `population` (pooled) or `default`.
+            over: the baseline: `driver_specific`, `pooled` or `default`.
             scope: `test`; `steady`, after its first seconds; or `full_trajectory`.
 
         Returns:
@@ -424,7 +427,7 @@ class Result:
         rows = self.pairs[self.pairs["method"] == "policy"]
         of_policy = rows.drop_duplicates("pair_id").set_index("pair_id")
         for baseline in self.methods:
-            column = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
+            column = f"improvement_over_{baseline}"
             if column in of_policy:
                 table[f"improvement/{baseline}"] = of_policy[column]
         return table.reset_index()

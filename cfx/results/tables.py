@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
+import numpy as np
 import pandas as pd
 from rich.console import RenderableType
 from rich.markup import escape
@@ -28,6 +29,7 @@ from cfx.core.parameters import Parameter
 from cfx.data.style import INDICATORS, style_distances, styles_by_site
 from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.sites import ALL_SITES, BASELINES
+from cfx.evaluation.statistics import improvement_statistics
 from cfx.evaluation.tables import scope_label
 from cfx.learners.curves import best_losses
 from cfx.policies.context import LEVEL as EXPECTED_LEVEL
@@ -62,8 +64,7 @@ class Pairs(ResultTable):
         Column("rmse_gap", "m", "RMSE of the gap on the test part"),
         Column("collisions", "1", "1 if the gap became negative", "int"),
         Column("METRIC", "as of the metric", "another metric of the test part"),
-        Column("improvement", "1", "improvement of the RMSE of speed over `fixed`"),
-        Column("improvement_over_METHOD", "1", "the same over another method"),
+        Column("improvement_over_METHOD", "1", "improvement of the RMSE of speed over a method"),
         Column("steady_METRIC", "as of the metric", "a metric after the transient"),
         Column("full_trajectory_METRIC", "as of the metric", "a metric of the full trajectory"),
         Column("real_METRIC", "as of the metric", "a metric of the recorded driver"),
@@ -71,7 +72,7 @@ class Pairs(ResultTable):
         Column(
             "flat_NAME",
             "1",
-            "of the method `fixed`: on which share of the parameter's range the loss is within 5 %"
+            "of driver-specific parameters: on which share of the range the loss is within 5 %"
             " of its best; 1: the recording does not determine it",
         ),
         Column("forecast_METRIC", "as of the metric", "an error of the pair's forecasts"),
@@ -274,7 +275,7 @@ class KnownParameters:
         if fits is None or "noise_scale" not in fits:
             return None
         tuned = tuple(one for one in evaluation.parameters if f"median_{one.name}" in fits)
-        return cls(fits[fits["method"] == "fixed"], tuned)
+        return cls(fits[fits["method"] == "driver_specific"], tuned)
 
     @property
     def reliable(self) -> pd.Series:
@@ -378,7 +379,7 @@ class KnownParameters:
 
 
 class Fits(ResultTable):
-    """Errors of constant parameters, a row per pair and method; intervals of `fixed`."""
+    """Errors of constant parameters, a row per pair and method; intervals of `driver_specific`."""
 
     meaning = (
         "errors of constant parameters on the part that was calibrated on, and on the test part;"
@@ -394,7 +395,9 @@ class Fits(ResultTable):
         Column("test_rmse_speed", "m/s", "on the test part", required=False),
         Column("train_rmse_gap", "m", "on the part that was calibrated on", required=False),
         Column("test_rmse_gap", "m", "on the test part", required=False),
-        Column("median_NAME", "as of the parameter", "its median a posteriori, of `fixed`"),
+        Column(
+            "median_NAME", "as of the parameter", "its median a posteriori, of `driver_specific`"
+        ),
         Column("low_NAME", "as of the parameter", "the lower end of its 90 % interval"),
         Column("high_NAME", "as of the parameter", "the upper end"),
         Column(
@@ -432,14 +435,16 @@ class Fits(ResultTable):
 
 
 def history_metrics(history: pd.DataFrame) -> dict[str, float]:
-    """Return `history/BASE/AMOUNT/rmse_improvement`, means over pairs.
+    """Return `history/BASE/AMOUNT/improvement`, geometric over drivers.
 
     AMOUNT is `80pct` for "80 %" and `10s` for "10 s".
     """
     values = {}
-    for (base, amount), gains in history.groupby(["base", "amount"])["improvement"]:
+    for (base, amount), rows in history.groupby(["base", "amount"]):
         name = str(amount).replace(" ", "").replace("%", "pct")
-        values[f"history/{base}/{name}/rmse_improvement"] = float(gains.mean())
+        ratios = 1.0 - rows["improvement"].to_numpy(float)
+        found = improvement_statistics(np.ones_like(ratios), ratios, rows["driver"].tolist())
+        values[f"history/{base}/{name}/improvement"] = found.geometric
     return values
 
 
@@ -472,7 +477,7 @@ class Sites(ResultTable):
             for metric in ("rmse_speed", "rmse_gap"):
                 columns[f"{metric}_{method}"] = f"{metric}/{method}"
         for baseline in BASELINES:
-            columns[f"over_{baseline}"] = f"rmse_improvement/{baseline}"
+            columns[f"over_{baseline}"] = f"improvement/rmse_speed/{baseline}"
         found: dict[str, float] = {}
         table = evaluation.tables["sites"]
         for _, row in table[table["driver_type"] == ALL_SITES].iterrows():
@@ -575,8 +580,8 @@ _WORSE = 1.1
 class Past(ResultTable):
     """What each driver's past says of the policy and of their own parameters, and what came of it.
 
-    METHOD is `fixed`, the driver's own parameters; `alone`, the policy alone; or `policy`, as it
-    was tested: beside the driver's own parameters, if it combines.
+    METHOD is `driver_specific`, the driver's own parameters; `alone`, the policy alone; or
+    `policy`, as it was tested: beside the driver's own parameters, if it combines.
     """
 
     meaning = "what each driver's past says of the policy (`protocol.combine`, `protocol=transfer`)"
@@ -616,7 +621,7 @@ class Past(ResultTable):
             "past/rmse_speed/alone": float(table["rmse_speed_alone"].mean()),
             "past/ratio/alone": _ratio(table["past_rmse_speed_alone"], table),
         }
-        for method in ("policy", "fixed"):
+        for method in ("policy", "driver_specific"):
             bound = table[f"bound_{method}"].dropna()
             if len(bound):
                 below = table.loc[bound.index, f"rmse_speed_{method}"] <= bound
@@ -639,7 +644,7 @@ class Past(ResultTable):
             yield (
                 f"Expected of {EXPECTED_LEVEL:.0%} of drivers, from their past: RMSE of speed below"
                 f" {metrics['past/bound/policy']:.3f} m/s (own parameters alone"
-                f" {metrics['past/bound/fixed']:.3f} m/s); so it is for"
+                f" {metrics['past/bound/driver_specific']:.3f} m/s); so it is for"
                 f" {metrics['past/coverage/policy']:.0%} of them (bound_policy in past.csv)."
             )
         if metrics.get("past/unlike", 0.0) > _FEW:
@@ -660,6 +665,6 @@ class Past(ResultTable):
 
 def _ratio(error: pd.Series, table: pd.DataFrame) -> float:
     """Returns the median ratio of an error in the past to that of drivers' own parameters."""
-    own = table["past_rmse_speed_fixed"]
+    own = table["past_rmse_speed_driver_specific"]
     ratio = (error / own.where(own > 0)).dropna()
     return float(ratio.median()) if len(ratio) else math.nan

@@ -77,14 +77,14 @@ for model in ("idm", "krauss"):
 # ## Which model describes them better?
 #
 # Compare errors on the part that was not calibrated on. `default` are the model's default
-# parameters, `population` one pooled set for all training drivers, `fixed` each driver's own.
+# parameters, `pooled` one pooled set for all training drivers, `driver_specific` each driver's own.
 
 # %%
 table = pd.DataFrame(
     {
         model: {
             method: result.metrics[f"rmse_speed/{method}"]
-            for method in ("default", "population", "fixed")
+            for method in ("default", "pooled", "driver_specific")
         }
         for model, result in results.items()
     }
@@ -100,7 +100,9 @@ print(table.round(3))
 # %%
 errors = pd.DataFrame(
     {
-        model: result.pairs[result.pairs["method"] == "fixed"].set_index("pair_id")["rmse_speed"]
+        model: result.pairs[result.pairs["method"] == "driver_specific"].set_index("pair_id")[
+            "rmse_speed"
+        ]
         for model, result in results.items()
     }
 )
@@ -121,7 +123,7 @@ print(f"mean difference {difference.mean():+.3f} m/s (95 % interval {low:+.3f} t
 
 # %%
 pairs = results["idm"].pairs
-own = pairs[pairs["method"] == "fixed"].filter(like="parameter_")
+own = pairs[pairs["method"] == "driver_specific"].filter(like="parameter_")
 print(own.rename(columns=lambda name: name.removeprefix("parameter_")).describe().round(2))
 
 # %% [markdown]

@@ -61,7 +61,7 @@ fit.plot().savefig("frames.png")
 # ## Four models
 #
 # Errors on the rest, simulated in closed loop: `default` parameters, one pooled set
-# (`population`), each driver's own (`fixed`).
+# (`pooled`), each driver's own (`driver_specific`).
 
 # %%
 fits = {"idm": fit}
@@ -79,7 +79,7 @@ print(pd.DataFrame(means).round(2))
 # %%
 errors = {}
 for model, one in fits.items():
-    own_sets = one.losses[one.losses["method"] == "fixed"]
+    own_sets = one.losses[one.losses["method"] == "driver_specific"]
     errors[model] = own_sets.set_index("pair_id")["test_rmse_gap"]
 best = pd.DataFrame(errors).idxmin(axis=1)
 print(best.value_counts().to_string())

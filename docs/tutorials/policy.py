@@ -39,13 +39,13 @@ result = cfx.run(
 # ## Against what?
 #
 # For a driver that nobody has recorded there are no own parameters, so the fair baseline is
-# `population`: one pooled set, calibrated on the same training drivers, on full trajectories. The
+# `pooled`: one pooled set, calibrated on the same training drivers, on full trajectories. The
 # interval is over drivers, because frames of one driver say little about the next.
 
 # %%
 metrics = result.metrics
-key = "full_trajectory/rmse_improvement/population"
-print(f"pooled {metrics['full_trajectory/rmse_speed/population']:.3f} m/s")
+key = "full_trajectory/improvement/rmse_speed/pooled"
+print(f"pooled {metrics['full_trajectory/rmse_speed/pooled']:.3f} m/s")
 print(f"policy {metrics['full_trajectory/rmse_speed/policy']:.3f} m/s")
 low, high = metrics[f"{key}/ci95_low"], metrics[f"{key}/ci95_high"]
 print(f"improvement {metrics[f'{key}/geometric']:+.1%} (95 % interval {low:+.1%} to {high:+.1%})")
@@ -64,10 +64,10 @@ print(f"improvement {metrics[f'{key}/geometric']:+.1%} (95 % interval {low:+.1%}
 
 # %%
 errors = result.pairs.pivot(index="pair_id", columns="method", values="rmse_speed")
-gain = 1 - errors["policy"] / errors["population"]
+gain = 1 - errors["policy"] / errors["pooled"]
 print(f"better for {(gain > 0).sum()} of {len(gain)}")
 print(f"worst {gain.min():+.0%}, median {gain.median():+.0%}, best {gain.max():+.0%}")
-print("the worst, m/s:", errors.loc[gain.idxmin(), ["population", "policy"]].round(3).to_dict())
+print("the worst, m/s:", errors.loc[gain.idxmin(), ["pooled", "policy"]].round(3).to_dict())
 
 # %% [markdown]
 # ![Speed and gap of the best, the median and the worst driver](drives.png)
@@ -76,7 +76,7 @@ print("the worst, m/s:", errors.loc[gain.idxmin(), ["population", "policy"]].rou
 
 # %%
 for name, unit in (("collisions", ""), ("hard_braking", "frames"), ("jerk", "m/s3")):
-    values = {method: metrics.get(f"{name}/{method}") for method in ("population", "policy")}
+    values = {method: metrics.get(f"{name}/{method}") for method in ("pooled", "policy")}
     print(name, {method: round(value, 2) for method, value in values.items()}, unit)
 
 figure = result.folder / "figures" / "drives.png"

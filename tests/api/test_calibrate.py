@@ -51,7 +51,7 @@ def fit(pairs: cfx.Pairs) -> cfx.Fit:
 def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
     """The job of the fit's command."""
     found = []
-    calibrated = Calibrator.fixed
+    calibrated = Calibrator.driver_specific
 
     def recorded(self: Calibrator, *given: Any) -> Tensor:
         found.append(calibrated(self, *given))
@@ -60,7 +60,7 @@ def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
     off = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
     folder = tmp_path_factory.mktemp("job") / "out"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Calibrator, "fixed", recorded)
+        patch.setattr(Calibrator, "driver_specific", recorded)
         cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
     return Job(found[0], stored_tables(folder)["fits"])
 
@@ -70,7 +70,7 @@ def test_parameters_are_those_of_the_command_to_the_last_bit(fit: cfx.Fit, job: 
 
 
 def test_errors_are_those_of_the_command(fit: cfx.Fit, job: Job) -> None:
-    for method in ("default", "fixed"):
+    for method in ("default", "driver_specific"):
         own = fit.losses[fit.losses["method"] == method].reset_index(drop=True)
         its = job.fits[job.fits["method"] == method].reset_index(drop=True)
         assert own["test_rmse_speed"].tolist() == its["test_rmse_speed"].tolist()
@@ -81,7 +81,7 @@ def test_errors_are_those_of_the_command(fit: cfx.Fit, job: Job) -> None:
 
 def test_driver_specific_parameters_have_the_lowest_loss(fit: cfx.Fit) -> None:
     train = fit.losses.groupby("method")["train_rmse_gap"].mean()
-    assert train["fixed"] <= train["population"] <= train["default"]
+    assert train["driver_specific"] <= train["pooled"] <= train["default"]
 
 
 def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
@@ -102,7 +102,7 @@ def test_a_posterior_is_that_of_the_command_and_gives_new_drivers(
     folder = tmp_path / "job"
     cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
     fits = pd.read_parquet(folder / "fits.parquet")
-    its = fits[fits["method"] == "fixed"].set_index("pair_id")
+    its = fits[fits["method"] == "driver_specific"].set_index("pair_id")
     pd.testing.assert_frame_equal(fit.intervals, its[fit.intervals.columns], check_names=False)
     its = pd.read_parquet(folder / "posterior.parquet")
     # A job takes the point estimates, where searches start, out of its table of means over frames.
@@ -203,7 +203,7 @@ def test_a_recorded_leader_is_followed_from_a_measured_state(
 def test_a_simulation_has_the_errors_that_a_fit_says(fit: cfx.Fit, pairs: cfx.Pairs) -> None:
     split = int(fit._last[0])
     drive = cfx.simulate("idm", fit, pairs, at=split * 0.1)
-    own = fit.losses[fit.losses["method"] == "fixed"].set_index("pair_id")
+    own = fit.losses[fit.losses["method"] == "driver_specific"].set_index("pair_id")
     for pair in pairs.selected:
         speed = drive.loc[drive["pair_id"] == pair.pair_id, "speed"].to_numpy()[1:]
         error = np.sqrt(np.mean((speed - pair.follower_speed[split + 1 :]) ** 2))

@@ -57,7 +57,9 @@ def test_a_model_that_is_defined_again_is_another_one() -> None:
         cls = define(pull)
         assert cfx.get("model", "mine") is cls
         fit = cfx.calibrate(pairs, "mine", optimizer="random")
-        ends.append(fit.losses.loc[fit.losses["method"] == "fixed", "train_rmse_speed"].tolist())
+        ends.append(
+            fit.losses.loc[fit.losses["method"] == "driver_specific", "train_rmse_speed"].tolist()
+        )
     assert ends[0] != ends[1]
     assert define(0.1)().identity()["code"] != define(0.1)().identity()["code"]
 

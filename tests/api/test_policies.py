@@ -68,10 +68,10 @@ def test_training_is_that_of_the_command_to_the_last_bit(
 
 
 def test_a_result_says_how_much_the_policy_improves(trained: cfx.plugin.Result) -> None:
-    found = trained.improvement(over="population")
-    assert found["geometric"] == trained.metrics["rmse_improvement/population/geometric"]
+    found = trained.improvement(over="pooled")
+    assert found["geometric"] == trained.metrics["improvement/rmse_speed/pooled/geometric"]
     assert found["ci95_low"] <= found["geometric"] <= found["ci95_high"]
-    with pytest.raises(DataError, match="known there: default, population, fixed"):
+    with pytest.raises(DataError, match="known there: default, pooled, driver_specific"):
         trained.improvement(over="defaults")
     assert "rmse_speed" in trained._repr_html_()
     assert "not saved" in repr(trained)

@@ -1,7 +1,7 @@
 """Memory and CPU time of one calibration of I-80's drivers, from 4,096 candidates each, on one core.
 
-`python -m tests.benchmarks.calibration_memory fixed --model krauss --copies 4`: `fixed`,
-`population` (the pooled sets of six networks) or `labels`; `--copies` makes more drivers of the 229
+`python -m tests.benchmarks.calibration_memory driver_specific --model krauss --copies 4`: `driver_specific`,
+`pooled` (the pooled sets of six networks) or `labels`; `--copies` makes more drivers of the 229
 that `../shared/data` has.
 """
 
@@ -55,11 +55,11 @@ def calibrate(what: str, model: DrivingModel, pairs: PairSet, batch: PairBatch) 
     )
     settings = WindowSettings()
     split = Split.of(pairs, settings, 0.8)
-    if what == "fixed":
-        tool.fixed(pairs, batch, split.frame)
-    elif what == "population":
+    if what == "driver_specific":
+        tool.driver_specific(pairs, batch, split.frame)
+    elif what == "pooled":
         number = torch.arange(_NETWORKS)[:, None]
-        tool.population(pairs, batch, split.frame, torch.arange(len(pairs)) % _NETWORKS != number)
+        tool.pooled(pairs, batch, split.frame, torch.arange(len(pairs)) % _NETWORKS != number)
     else:
         fixed = model.space.defaults().expand(len(pairs), -1)
         tool.labels(pairs, batch, Windows.of(split.windows, settings), fixed)
@@ -68,7 +68,7 @@ def calibrate(what: str, model: DrivingModel, pairs: PairSet, batch: PairBatch) 
 def main() -> None:
     """Measures and prints."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", choices=["fixed", "population", "labels"])
+    parser.add_argument("what", choices=["driver_specific", "pooled", "labels"])
     parser.add_argument("--model", default="krauss")
     parser.add_argument("--copies", type=int, default=1)
     options = parser.parse_args()

@@ -132,7 +132,7 @@ def bias(
     batch = PairBatch.of(pairs)
     stepper = MemoryStepper(model, batch.dt)
     solver = Solver(stepper, GradientSearch(), 0, objective or SpeedRmse())
-    found = Calibrator(solver, cache=Cache(None)).fixed(pairs, batch, batch.lengths - 1)
+    found = Calibrator(solver, cache=Cache(None)).driver_specific(pairs, batch, batch.lengths - 1)
     return [round(100 * one, 1) for one in ((found - truth) / truth).median(0).values.tolist()]
 
 

@@ -29,7 +29,7 @@ from cfx.simulation.trajectory import Segments
 numba_loops = pytest.importorskip("tests.benchmarks.numba_loops", reason="numba is not installed")
 
 DT, STEPS, SAMPLES, MEMORY = 0.1, 600, 4096, 1 << 30
-WORK = {"fixed": (60, STEPS), "population": (60, STEPS), "labels": (7200, 5)}
+WORK = {"driver_specific": (60, STEPS), "pooled": (60, STEPS), "labels": (7200, 5)}
 """Segments of each calibration and the steps of each: as many vehicle steps in all three."""
 
 _SAME = {"rtol": 1e-9, "atol": 1e-9}
@@ -116,7 +116,7 @@ def test_calibration(benchmark: Any, name: str, kind: str) -> None:
     own = segments(model, *WORK[kind])
     losses: SegmentLosses | PooledLosses = own
     guess = model.space.to_unit(model.space.defaults())
-    if kind == "population":
+    if kind == "pooled":
         losses = PooledLosses(own, torch.ones((1, own.problems), dtype=torch.bool), MEMORY)
     guesses = guess.expand(losses.problems, 1, -1)
     search = RandomSearch(samples=SAMPLES)
@@ -144,7 +144,7 @@ def test_calibration(benchmark: Any, name: str, kind: str) -> None:
     torch.testing.assert_close(
         own.for_work(SAMPLES)(points_of(model).expand(own.problems, -1, -1)), wanted, **_SAME
     )
-    if kind == "population":
+    if kind == "pooled":
         wanted = wanted.mean(0, keepdim=True)
     # The default set, which only the calibration tries, may be better than all of them. Losses that
     # are equal up to a millionth are ties, of which the nearest to the default wins.

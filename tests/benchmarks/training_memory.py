@@ -30,7 +30,7 @@ def main(count: int) -> None:
         index=torch.arange(count),
         split=data.pairs.split[copies],
         network=torch.zeros(count, dtype=torch.int64),
-        fixed=data.pairs.fixed[copies] + 0.01 * spread,
+        fixed=data.pairs.start[copies] + 0.01 * spread,
         drivers=tuple(str(number) for number in range(count)),
     )
     data = replace(data, recorded=data.recorded[copies], pairs=pairs, names=("all",))

@@ -55,7 +55,7 @@ tool = module.Calibrator(
 (here / f"ready-{{os.getpid()}}").touch()
 while not (here / "go").exists():
     time.sleep(0.01)
-fixed = tool.fixed(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 200))
+fixed = tool.driver_specific(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 200))
 print(fixed.tolist())
 """
 

@@ -80,7 +80,7 @@ def calibrator(
 def everything(tool: Calibrator, pairs: PairSet) -> tuple[Tensor, Tensor]:
     batch = PairBatch.of(pairs)
     last = torch.full((len(pairs),), 200)
-    fixed = tool.fixed(pairs, batch, last)
+    fixed = tool.driver_specific(pairs, batch, last)
     windows = Windows.of(torch.full((len(pairs),), 40), SETTINGS)
     return fixed, tool.labels(pairs, batch, windows, fixed).parameters
 
@@ -99,7 +99,7 @@ def test_constant_true_parameters_are_recovered(
 ) -> None:
     pairs = wavy_pairs(model, true, frames=400)
     tool = calibrator(RandomSearch(samples=4096), model=model)
-    fixed = tool.fixed(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 320))
+    fixed = tool.driver_specific(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 320))
     low, high = model.space.bounds()
     error = dict(
         zip(model.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True)
@@ -256,7 +256,7 @@ def test_a_cache_that_cannot_be_written_is_said(tmp_path: Path) -> None:
 def test_constant_drivers_of_the_synthetic_dataset_are_recovered() -> None:
     pairs = SyntheticDataset(variation=0.0, pairs=6, frames=500, seed=3).load()
     tool = calibrator(GradientSearch())
-    fixed = tool.fixed(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 400))
+    fixed = tool.driver_specific(pairs, PairBatch.of(pairs), torch.full((len(pairs),), 400))
     true = torch.tensor(
         [[pair.truth[name][0] for name in tool.space.names] for pair in pairs], dtype=torch.float64
     )
@@ -311,9 +311,9 @@ def test_the_number_of_cores_changes_no_bit(samples: int, request: pytest.Fixtur
     batch = PairBatch.of(pairs)
     tool = calibrator(RandomSearch(samples=samples))
     threads.limit_cores(1)
-    alone = tool.fixed(pairs, batch, batch.lengths - 1)
+    alone = tool.driver_specific(pairs, batch, batch.lengths - 1)
     threads.limit_cores(None)
-    assert torch.equal(tool.fixed(pairs, batch, batch.lengths - 1), alone)
+    assert torch.equal(tool.driver_specific(pairs, batch, batch.lengths - 1), alone)
 
 
 class Elsewhere(Engine):
@@ -354,10 +354,10 @@ def test_a_cluster_shares_drivers_among_its_workers_and_changes_no_bit(
     members = torch.tensor([[True] * 5, [True, False, True, True, False]])
     here = calibrator(optimizer)
     there = calibrator(optimizer, engine=elsewhere)
-    expected = here.fixed(pairs, batch, last)
-    assert torch.equal(there.fixed(pairs, batch, last), expected)
+    expected = here.driver_specific(pairs, batch, last)
+    assert torch.equal(there.driver_specific(pairs, batch, last), expected)
     assert [len(shard.batch) for shard in elsewhere.shards] == [2, 2, 1]
     elsewhere.shards.clear()
-    expected = here.population(pairs, batch, last, members)
-    assert torch.equal(there.population(pairs, batch, last, members), expected)
+    expected = here.pooled(pairs, batch, last, members)
+    assert torch.equal(there.pooled(pairs, batch, last, members), expected)
     assert len(elsewhere.shards) == 1, "what is simulated for one group serves all"

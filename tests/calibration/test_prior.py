@@ -43,7 +43,7 @@ def found(prior: float, folder: Path | None = None) -> torch.Tensor:
         ),
         cache=Cache(folder),
     )
-    return calibrator.fixed(PAIRS, BATCH, BATCH.lengths - 1)
+    return calibrator.driver_specific(PAIRS, BATCH, BATCH.lengths - 1)
 
 
 def losses() -> SegmentLosses:
@@ -108,8 +108,8 @@ def test_what_does_not_matter_returns_to_its_default(optimizer: Optimizer) -> No
         cache=Cache(None),
     )
     last = torch.full_like(BATCH.lengths, 100)
-    own = calibrator.fixed(PAIRS, BATCH, last)
-    pooled = calibrator.population(PAIRS, BATCH, last, torch.ones((1, 2), dtype=torch.bool))
+    own = calibrator.driver_specific(PAIRS, BATCH, last)
+    pooled = calibrator.pooled(PAIRS, BATCH, last, torch.ones((1, 2), dtype=torch.bool))
     unit = model.space.to_unit(torch.cat([own, pooled]))
     away = (unit - model.space.to_unit(model.space.defaults()))[:, -2:].abs()
     assert float(away.max()) < 1e-3

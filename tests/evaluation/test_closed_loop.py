@@ -218,7 +218,7 @@ def test_the_table_says_what_the_loops_did() -> None:
             Followers(batch, torch.arange(2)),
             first,
         ),
-        "fixed": simulate_closed_loop(
+        "driver_specific": simulate_closed_loop(
             stepper,
             constant(model, torch.tensor([[4.0, 0.1], [4.0, 0.1]]).double()),
             Followers(batch, torch.arange(2)),
@@ -236,15 +236,18 @@ def test_the_table_says_what_the_loops_did() -> None:
     result = evaluate(ComparedPairs(pairs, batch, first, style), {"test": loops}, model.space)
     table = result.table.set_index(["pair_id", "method"])
     assert table.loc[("p0", "policy"), "rmse_speed"] == pytest.approx(0, abs=1e-9)
-    assert table.loc[("p1", "policy"), "improvement"] == pytest.approx(1)
+    assert table.loc[("p1", "policy"), "improvement_over_driver_specific"] == pytest.approx(1)
     assert table.loc[("p1", "policy"), "parameter_t_r"] == pytest.approx(3.0)
-    assert table.loc[("p1", "fixed"), "frames"] == 99
-    real, simulated = pairs[0].follower_speed[151:], result.trajectories[0].speed["fixed"][1:]
+    assert table.loc[("p1", "driver_specific"), "frames"] == 99
+    real, simulated = (
+        pairs[0].follower_speed[151:],
+        result.trajectories[0].speed["driver_specific"][1:],
+    )
     expected = math.sqrt(((real - simulated) ** 2).mean())
-    assert table.loc[("p0", "fixed"), "rmse_speed"] == pytest.approx(expected)
+    assert table.loc[("p0", "driver_specific"), "rmse_speed"] == pytest.approx(expected)
     metrics = result.metrics()
-    assert metrics["rmse_speed/fixed"] == pytest.approx(
-        result.table.query("method == 'fixed'").rmse_speed.mean()
+    assert metrics["rmse_speed/driver_specific"] == pytest.approx(
+        result.table.query("method == 'driver_specific'").rmse_speed.mean()
     )
     assert metrics["collisions/policy"] == 0
 
@@ -266,8 +269,8 @@ def test_a_collision_is_counted() -> None:
     )
     result = evaluate(
         ComparedPairs(pairs, batch, first, style),
-        {"test": {"default": loop, "fixed": loop, "policy": crashed}},
+        {"test": {"default": loop, "driver_specific": loop, "policy": crashed}},
         model.space,
     )
     assert result.metrics()["collisions/policy"] == 1
-    assert result.metrics()["collisions/fixed"] == 0
+    assert result.metrics()["collisions/driver_specific"] == 0

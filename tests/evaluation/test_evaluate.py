@@ -37,7 +37,7 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
         {},
         (0.3, 0.7),
     )
-    loops = {"default": calm, "fixed": calm, "policy": hard}
+    loops = {"default": calm, "driver_specific": calm, "policy": hard}
     found = evaluate(
         ComparedPairs(pairs, batch, first, style),
         {"test": loops, "full_trajectory": {"default": calm, "policy": hard}},
@@ -50,25 +50,25 @@ def test_the_table_and_the_metrics_tell_what_was_driven() -> None:
     assert table.loc[("p0", "policy"), "jerk"] == pytest.approx(math.sqrt(2 * 100**2 / 9))
     assert table["real_jerk"].to_numpy() == pytest.approx(0, abs=1e-9)
     metrics = found.metrics()
-    assert (metrics["hard_braking/policy"], metrics["hard_braking/fixed"]) == (1, 0)
+    assert (metrics["hard_braking/policy"], metrics["hard_braking/driver_specific"]) == (1, 0)
     assert metrics["jerk/policy"] == pytest.approx(math.sqrt(2 * 100**2 / 9) / 2)
     assert metrics["jerk/real"] == pytest.approx(0, abs=1e-9)
-    assert (metrics["at_bounds/policy"], metrics["at_bounds/fixed"]) == (0.5, 0)
+    assert (metrics["at_bounds/policy"], metrics["at_bounds/driver_specific"]) == (0.5, 0)
     assert (
         metrics["full_trajectory/hard_braking/policy"],
         metrics["full_trajectory/collisions/policy"],
     ) == (1, 0)
-    assert "full_trajectory/collisions/fixed" not in metrics
+    assert "full_trajectory/collisions/driver_specific" not in metrics
     adaptation_space = model.space.for_adaptation(
         {model.space.names[0]: (0.1, 20.0)}
     )  # then the policy's value is none of its bounds
     within = evaluate(
         ComparedPairs(pairs, batch, first, style),
-        {"test": {**loops, "fixed": hard}},
+        {"test": {**loops, "driver_specific": hard}},
         model.space,
         policy_space=adaptation_space,
     ).metrics()
-    assert (within["at_bounds/policy"], within["at_bounds/fixed"]) == (0, 0.5)
+    assert (within["at_bounds/policy"], within["at_bounds/driver_specific"]) == (0, 0.5)
 
 
 def test_a_table_without_these_columns_still_has_its_other_metrics() -> None:
@@ -97,15 +97,15 @@ def test_what_comes_after_the_start_is_measured_on_its_own() -> None:
         {},
         (0.3, 0.7),
     )
-    loops = {"fixed": loop(0.5), "policy": loop(0.2)}
+    loops = {"driver_specific": loop(0.5), "policy": loop(0.2)}
     found = evaluate(ComparedPairs(pairs, batch, first, style), {"test": loops}, Krauss().space)
     table = found.table.set_index(["pair_id", "method"])["steady_rmse_speed"]
-    assert table["p0"].to_dict() == pytest.approx({"fixed": 0.5, "policy": 0.2})
+    assert table["p0"].to_dict() == pytest.approx({"driver_specific": 0.5, "policy": 0.2})
     assert table["p1"].isna().all()
     metrics = found.metrics()
     assert metrics["steady/rmse_speed/policy"] == pytest.approx(0.2)
-    assert metrics["steady/rmse_improvement/fixed/geometric"] == pytest.approx(0.6)
-    assert found.improvements["steady"]["fixed"].undefined == 1
+    assert metrics["steady/improvement/rmse_speed/driver_specific/geometric"] == pytest.approx(0.6)
+    assert found.improvements["steady"]["driver_specific"].undefined == 1
     alone = {
         method: ClosedLoop(*(values[1:] for values in one[:4])) for method, one in loops.items()
     }

@@ -7,13 +7,13 @@ import math
 from cfx.evaluation.headline import fitted_errors, headline, main_error
 
 METRICS = {
-    "rmse_improvement/geometric": 0.21584,
-    "rmse_improvement/ci95_low": 0.1688,
-    "rmse_improvement/ci95_high": 0.2621,
-    "steady/rmse_improvement/geometric": 0.13,
+    "improvement/rmse_speed/driver_specific/geometric": 0.21584,
+    "improvement/rmse_speed/driver_specific/ci95_low": 0.1688,
+    "improvement/rmse_speed/driver_specific/ci95_high": 0.2621,
+    "steady/improvement/rmse_speed/driver_specific/geometric": 0.13,
     "rmse_speed/policy": 0.58432,
-    "rmse_speed/fixed": 0.7351,
-    "rmse_speed/population": 0.6861,
+    "rmse_speed/driver_specific": 0.7351,
+    "rmse_speed/pooled": 0.6861,
 }
 
 
@@ -36,11 +36,11 @@ def test_an_improvement_is_in_percent_with_its_interval() -> None:
 def test_mean_errors_that_contradict_are_told() -> None:
     """A few drivers with large errors outweigh all others in a ratio of mean errors."""
     metrics = {
-        "rmse_improvement/geometric": -0.014,
-        "rmse_improvement/ratio_of_means": 0.124,
-        "rmse_improvement/drivers": 5.0,
+        "improvement/rmse_speed/driver_specific/geometric": -0.014,
+        "improvement/rmse_speed/driver_specific/ratio_of_means": 0.124,
+        "improvement/rmse_speed/driver_specific/drivers": 5.0,
         "rmse_speed/policy": 0.624,
-        "rmse_speed/fixed": 0.712,
+        "rmse_speed/driver_specific": 0.712,
     }
     _, words = headline(metrics)
     assert words == (
@@ -50,18 +50,20 @@ def test_mean_errors_that_contradict_are_told() -> None:
 
 
 def test_without_driver_specific_parameters_it_is_over_pooled_ones() -> None:
-    metrics = {"full_trajectory/rmse_improvement/population/geometric": 0.1}
+    metrics = {"full_trajectory/improvement/rmse_speed/pooled/geometric": 0.1}
     words = "+10.0 % over pooled on full trajectories"
     assert headline(metrics) == ({"improvement_percent": 10.0}, words)
 
 
 def test_a_baseline_whose_error_is_not_known_has_no_error_in_the_words() -> None:
-    _, words = headline({"rmse_improvement/geometric": 0.1, "rmse_speed/policy": 0.5})
+    _, words = headline(
+        {"improvement/rmse_speed/driver_specific/geometric": 0.1, "rmse_speed/policy": 0.5}
+    )
     assert words == "+10.0 % over driver-specific; RMSE of speed 0.500 m/s"
 
 
 def test_a_calibration_is_known_by_the_drivers_own_parameters() -> None:
-    metrics = {"rmse_speed/fixed": 0.7351, "rmse_speed/population": 0.6861}
+    metrics = {"rmse_speed/driver_specific": 0.7351, "rmse_speed/pooled": 0.6861}
     values, words = headline(metrics)
     assert words == "calibration; driver-specific 0.735 m/s; pooled 0.686 m/s"
     assert values == {
@@ -75,14 +77,14 @@ def test_a_calibration_is_known_by_the_drivers_own_parameters() -> None:
 
 def test_what_is_asked_first_of_the_judged_method_has_no_group() -> None:
     of_all = {}
-    for method, value in (("policy", 1.0), ("fixed", 2.0)):
+    for method, value in (("policy", 1.0), ("driver_specific", 2.0)):
         of_all |= {f"rmse_gap/{method}": value, f"collisions/{method}": value}
     values, _ = headline({**METRICS, **of_all})
     assert (values["rmse_gap_m"], values["collisions"]) == (1.0, 1.0)
     assert len(values) <= 10
     del of_all["rmse_gap/policy"]
     calibrated = {name: value for name, value in of_all.items() if "policy" not in name}
-    values, _ = headline({"rmse_speed/fixed": 0.7, **calibrated})
+    values, _ = headline({"rmse_speed/driver_specific": 0.7, **calibrated})
     assert (values["rmse_gap_m"], values["collisions"]) == (2.0, 2.0)
     assert fitted_errors({"rmse_speed": 0.41234, "rmse_gap": math.nan}) == {
         "rmse_speed_fitted_mps": 0.412
@@ -90,6 +92,9 @@ def test_what_is_asked_first_of_the_judged_method_has_no_group() -> None:
 
 
 def test_what_is_not_defined_is_not_said() -> None:
-    metrics = {"rmse_improvement/geometric": math.nan, "rmse_speed/policy": math.nan}
+    metrics = {
+        "improvement/rmse_speed/driver_specific/geometric": math.nan,
+        "rmse_speed/policy": math.nan,
+    }
     assert headline(metrics) == ({}, "")
     assert headline({}) == ({}, "calibration")

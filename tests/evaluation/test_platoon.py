@@ -59,7 +59,8 @@ STABLE, UNSTABLE = (2.0, 0.5, 0.8), (1.0, 0.4, 0.5)  # 5.2 and 1.4
 def measured(model: DrivingModel, *parameters: tuple[float, ...]) -> Platoon:
     values = torch.tensor(parameters).double()
     found = measure_platoons(
-        model, {"fixed": (constant(model, values), [f"set {k}" for k in range(len(values))])}
+        model,
+        {"driver_specific": (constant(model, values), [f"set {k}" for k in range(len(values))])},
     )
     assert found is not None
     return found
@@ -78,10 +79,12 @@ def test_a_stable_model_is_distinguished_from_an_unstable_one() -> None:
 def test_the_metrics_summarize_the_platoons_of_a_method() -> None:
     platoon = measured(Linear(), STABLE, UNSTABLE)
     metrics, both = platoon.metrics(), platoon.measures
-    assert metrics["platoon/amplification/fixed"] == pytest.approx(both["amplification"].mean())
-    assert metrics["platoon/string_stable/fixed"] == 0.5
-    assert metrics["platoon/min_gap/fixed"] == both["min_gap"].min()
-    assert metrics["platoon/collisions/fixed"] == both["collisions"].sum()
+    assert metrics["platoon/amplification/driver_specific"] == pytest.approx(
+        both["amplification"].mean()
+    )
+    assert metrics["platoon/string_stable/driver_specific"] == 0.5
+    assert metrics["platoon/min_gap/driver_specific"] == both["min_gap"].min()
+    assert metrics["platoon/collisions/driver_specific"] == both["collisions"].sum()
 
 
 def test_krauss_settles_at_its_equilibrium_gap() -> None:

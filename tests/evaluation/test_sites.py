@@ -33,7 +33,7 @@ def made(sites: tuple[str, ...]) -> pd.DataFrame | None:
     )
     measured = {}
     for metric in ("rmse_speed", "rmse_gap"):
-        measured[metric, "test", "fixed"] = FIXED
+        measured[metric, "test", "driver_specific"] = FIXED
         measured[metric, "test", "policy"] = POLICY
     ids = [pair.pair_id for pair in pairs]
     values = long_table(ids, [pair.driver for pair in pairs], measured)
@@ -52,7 +52,7 @@ def test_each_site_has_a_row_and_each_counts_once_in_the_row_of_all() -> None:
     table = made(SITES)
     assert table is not None
     rows = table.set_index(["site", "driver_type"])
-    assert rows["over_fixed"].to_dict() == pytest.approx(
+    assert rows["over_driver_specific"].to_dict() == pytest.approx(
         {
             ("road", "all"): 0.2,
             ("track", "all"): 1 - math.sqrt(0.5),

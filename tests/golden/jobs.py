@@ -82,7 +82,7 @@ JOBS: dict[str, tuple[str, ...]] = {
         "learner.ensemble_size=2",
         "objective=speed_huber",
         "calibration.prior=none",
-        "protocol.base=population",
+        "protocol.base=pooled",
     ),
     "rollout_distilled": (
         *_LATER,

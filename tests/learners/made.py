@@ -60,9 +60,9 @@ def training_data(
     model = model or driven
     pairs = wavy_pairs(driven, TRUE, frames=frames)
     index = torch.arange(len(pairs)).repeat(networks)
-    fixed = model.space.defaults().expand(len(index), -1).clone()
+    start = model.space.defaults().expand(len(index), -1).clone()
     if isinstance(model, Krauss):
-        fixed[:] = torch.tensor([4.0, 0.8])
+        start[:] = torch.tensor([4.0, 0.8])
     data = TrainingData(
         stepper=MemoryStepper(model, 0.1),
         recorded=PairBatch.of(pairs),
@@ -70,7 +70,7 @@ def training_data(
             index=index,
             split=Split.none(pairs, WINDOWS)[index],
             network=torch.arange(networks).repeat_interleave(len(pairs)),
-            fixed=fixed,
+            start=start,
             drivers=tuple(pair.driver for pair in pairs) * networks,
         ),
         windows=WINDOWS,

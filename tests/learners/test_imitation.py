@@ -61,7 +61,7 @@ def training_data(
             index=torch.arange(pairs),
             split=split,
             network=network,
-            fixed=model.space.defaults().expand(pairs, 2),
+            start=model.space.defaults().expand(pairs, 2),
             labels=labels,
         ),
         windows=SETTINGS,
@@ -72,9 +72,9 @@ def training_data(
 
 def own_bases(data: TrainingData) -> torch.Tensor:
     """Returns a base for each driver, `(P, n)`, all different."""
-    shift = torch.linspace(-0.2, 0.2, len(data.pairs.fixed)).double()[:, None]
+    shift = torch.linspace(-0.2, 0.2, len(data.pairs.start)).double()[:, None]
     space = data.stepper.model.space
-    return space.from_unit(space.to_unit(data.pairs.fixed) + shift)
+    return space.from_unit(space.to_unit(data.pairs.start) + shift)
 
 
 def same_weights(one: TrainingResult, two: TrainingResult) -> bool:
@@ -104,10 +104,10 @@ def test_answers_as_offsets_begin_at_the_base_of_each_driver() -> None:
     learner = ImitationLearner(epochs=1, learning_rate=1e-12, head="offset")
     result = learner.fit(GruPolicy(), replace(data, pairs=replace(data.pairs, base=own)))
     assert result.base is not None
-    torch.testing.assert_close(result.base, data.pairs.fixed[:1], rtol=1e-6, atol=0)
+    torch.testing.assert_close(result.base, data.pairs.start[:1], rtol=1e-6, atol=0)
     agent = ready(result, data, GruPolicy())
     history = measured_history(data.batch, torch.arange(3), torch.full((3,), 50), SETTINGS.length)
-    for base, expected in ((own, own), (None, data.pairs.fixed)):
+    for base, expected in ((own, own), (None, data.pairs.start)):
         state = agent.begin(data.pairs.network, DriverContext(base=base))
         chosen, _ = agent.act(history, state)
         torch.testing.assert_close(chosen, expected, rtol=1e-5, atol=1e-6)
@@ -132,7 +132,7 @@ def test_offsets_are_learned_from_each_drivers_base_and_from_the_pooled_one() ->
         history = measured_history(data.batch, torch.arange(3), frames, SETTINGS.length)
         chosen, _ = agent.act(history, state)
         errors[name] = float((space.to_unit(chosen) - truth).abs().mean())
-    untrained = float((space.to_unit(data.pairs.fixed) - truth).abs().mean())
+    untrained = float((space.to_unit(data.pairs.start) - truth).abs().mean())
     assert errors["own"] < 0.3 * untrained
     assert errors["pooled"] < 0.7 * untrained
 

@@ -23,7 +23,7 @@ def test_of_many_pairs_as_many_of_each_network_are_measured(
             index=data.pairs.index[rows],
             split=data.pairs.split[rows],
             network=data.pairs.network[rows],
-            fixed=data.pairs.fixed[rows],
+            start=data.pairs.start[rows],
         ),
     )
     monkeypatch.setattr(base, "_PAIRS_AT_MOST", 3)

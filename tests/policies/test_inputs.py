@@ -104,9 +104,11 @@ def test_no_platoon_is_made_up_for_a_policy_that_reads_further_signals() -> None
     agent = adaptive({"name": "idm"}, further=("rain",))
     usual = adaptive({"name": "idm"})
     assert measure_platoons(IDM(), {"policy": (agent, ("all",))}) is None
-    platoon = measure_platoons(IDM(), {"policy": (agent, ("all",)), "fixed": (usual, ("all",))})
+    platoon = measure_platoons(
+        IDM(), {"policy": (agent, ("all",)), "driver_specific": (usual, ("all",))}
+    )
     assert platoon is not None
-    assert set(platoon.measures["method"]) == {"fixed"}
+    assert set(platoon.measures["method"]) == {"driver_specific"}
 
 
 class Unnamed(PolicyInput):

@@ -77,7 +77,7 @@ def test_an_answer_fades_to_the_base(offsets: bool) -> None:
     guarded = replace(agent, valid_range=RANGE)
     base = torch.tensor([[1.1, 0.2]], dtype=torch.float64)
     if not offsets:
-        guarded = replace(guarded, population=base)
+        guarded = replace(guarded, pooled=base)
     context = DriverContext(base if offsets else None)
 
     def chosen(who: object, speed: float) -> torch.Tensor:

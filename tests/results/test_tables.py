@@ -80,10 +80,10 @@ def test_the_gain_from_history_has_metrics_under_names_without_spaces() -> None:
     evaluation = make_results(pairs=4, frames=20).evaluation
     history = make_history(evaluation.trajectories, GAINS)
     assert History().metrics(measured(history=history)) == {
-        "history/own/0s/rmse_improvement": pytest.approx(-0.1),
-        "history/own/10s/rmse_improvement": pytest.approx(0.1),
-        "history/own/80pct/rmse_improvement": pytest.approx(0.2),
-        "history/population/80pct/rmse_improvement": pytest.approx(0.05),
+        "history/driver_specific/0s/improvement": pytest.approx(-0.1, abs=1e-3),
+        "history/driver_specific/10s/improvement": pytest.approx(0.1, abs=1e-3),
+        "history/driver_specific/80pct/improvement": pytest.approx(0.2, abs=1e-3),
+        "history/pooled/80pct/improvement": pytest.approx(0.05, abs=1e-3),
     }
 
 

@@ -187,8 +187,10 @@ def test_a_job_is_kept_under_the_names_of_the_contract(
 
 def test_undefined_metrics_are_kept_as_such(uri: str, client: Any) -> None:
     with begin(uri) as run:
-        run.log_metrics({"rmse_improvement/p_value": float("nan")})
-    assert np.isnan(client.get_run(run.run_id).data.metrics["rmse_improvement/p_value"])
+        run.log_metrics({"improvement/rmse_speed/driver_specific/p_value": float("nan")})
+    assert np.isnan(
+        client.get_run(run.run_id).data.metrics["improvement/rmse_speed/driver_specific/p_value"]
+    )
 
 
 def test_a_store_is_made_beside_the_outputs(
@@ -607,7 +609,7 @@ def test_flatten() -> None:
 def test_a_calibration_logs_no_improvement(
     uri: str, client: Any, saved_policy: SimpleNamespace
 ) -> None:
-    made = make_results(pairs=2, frames=10, methods=("default", "population", "fixed"))
+    made = make_results(pairs=2, frames=10, methods=("default", "pooled", "driver_specific"))
     evaluation = dataclasses.replace(made.evaluation, purpose=Purpose.CALIBRATION)
     with begin(uri) as run:
         log_job(run, dataclasses.replace(made, evaluation=evaluation), saved_policy)

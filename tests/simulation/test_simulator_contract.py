@@ -75,7 +75,7 @@ def test_a_model_without_equations_is_refused_by_what_uses_equations() -> None:
 def error(tmp_path_factory: pytest.TempPathFactory) -> float:
     """The error of driver-specific parameters, simulated as ever."""
     job = run_job(JobConfig.of(values_of(*QUICK)), tmp_path_factory.mktemp("memory") / "job")
-    return float(job.metrics["rmse_speed/fixed"])
+    return float(job.metrics["rmse_speed/driver_specific"])
 
 
 def test_a_third_partys_simulator_takes_the_steps_of_a_job(
@@ -83,7 +83,7 @@ def test_a_third_partys_simulator_takes_the_steps_of_a_job(
 ) -> None:
     install("mine-sims", {"cfx.simulators": {"mine": "mine_sims:Mine"}}, {"mine_sims.py": HALVING})
     theirs = run_job(JobConfig.of(values_of(*QUICK, "simulator=mine")), tmp_path / "mine")
-    assert theirs.metrics["rmse_speed/fixed"] != error
+    assert theirs.metrics["rmse_speed/driver_specific"] != error
     node = JobConfig.of(values_of("simulator=mine", "simulator.memory_mb=64")).simulator
     assert node == {"name": "mine", "memory_mb": 64}
 
@@ -139,4 +139,4 @@ def test_what_was_never_a_setting_is_refused_by_its_name() -> None:
 def test_shards_do_not_change_the_numbers(tmp_path: Path, error: float) -> None:
     """The bound of memory cuts the work into shards, and nothing else."""
     few = run_job(JobConfig.of(values_of(*QUICK, "simulator.memory_mb=16")), tmp_path)
-    assert few.metrics["rmse_speed/fixed"] == error
+    assert few.metrics["rmse_speed/driver_specific"] == error

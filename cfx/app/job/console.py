@@ -219,11 +219,11 @@ def _undefined(compared: Mapping[str, Improvement]) -> list[str]:
 def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
     """Returns what the table compares, by what it says in its first column."""
     candidates = [
-        ("test", "fixed", ""),
-        ("steady", "fixed", f",\nafter {TRANSIENT_S:g} s"),
+        ("test", "driver_specific", ""),
+        ("steady", "driver_specific", f",\nafter {TRANSIENT_S:g} s"),
         ("test", "shrunk", ""),
-        ("test", "population", ""),
-        ("full_trajectory", "population", ", full"),
+        ("test", "pooled", ""),
+        ("full_trajectory", "pooled", ", full"),
     ]
     compared = {}
     for scope, baseline, part in candidates:
@@ -270,7 +270,7 @@ def _safety(evaluation: Evaluation, metrics: Mapping[str, float]) -> list[str]:
         sentences.append(f"Parameters at their bounds: {at_bounds}.")
     lines = [" ".join(sentences)] if sentences else []
     shares = flat_for(evaluation.table, evaluation.names)
-    pairs = int((evaluation.about["method"] == "fixed").sum())
+    pairs = int((evaluation.about["method"] == "driver_specific").sum())
     undetermined = []
     for name, share in shares.items():
         if share > 0:

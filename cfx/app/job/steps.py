@@ -55,7 +55,7 @@ from cfx.simulation.windows import Split
 
 log = logging.getLogger(__name__)
 
-_CONSTANT = ("default", "population", "fixed")
+_CONSTANT = ("default", "pooled", "driver_specific")
 
 _WINDOW_S = 0.5
 """Length of a window in the paper, and with default settings at NGSIM's time step of 0.1 s."""
@@ -74,7 +74,7 @@ def calibration_tables(
         fits: see `cfx.results.tables.Fits`; with a posterior it has `DriverPosteriors.columns`.
         Further ones with a posterior, see `DriverPosteriors.tables`.
     """
-    calibrated = "fixed" in evaluation.methods and bool(evaluation.names)
+    calibrated = "driver_specific" in evaluation.methods and bool(evaluation.names)
     elsewhere = not isinstance(context.stepper, MemoryStepper)
     if not calibrated and settings.posterior != "none":
         log.warning(
@@ -101,7 +101,7 @@ def calibration_tables(
                 rows[f"train_{name}"] = values.cpu().numpy()
                 if context.split < 1:  # else nothing was tested
                     rows[f"test_{name}"] = of_method[name].to_numpy(dtype=np.float64)
-            if method == "fixed" and settings.posterior != "none":
+            if method == "driver_specific" and settings.posterior != "none":
                 solver = context.calibrator.solver
                 method_of = posterior_method(settings.posterior)
                 known = method_of.find(solver, batch, last, parameters, settings)
@@ -109,7 +109,7 @@ def calibration_tables(
                 tables = known.tables(ids)
             fits.append(rows)
     if not elsewhere:
-        best = _parameters(evaluation, "fixed", ids, batch.leader_length)
+        best = _parameters(evaluation, "driver_specific", ids, batch.leader_length)
         tables["slices"] = slices(context.calibrator, batch, last, best, ids)
     return {**tables, "fits": pd.concat(fits, ignore_index=True)}
 

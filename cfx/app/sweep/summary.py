@@ -26,8 +26,8 @@ SUMMARY = "summary.csv"
 
 _STATISTICS = ("geometric", "ci95_low", "ci95_high", "ratio_of_means", "drivers")
 _COMPARED = ["pair_id", "driver", "frames", "method", "rmse_speed"]
-_METHODS = ("default", "fixed", "population", "policy")
-_SHOWN = ("default", "population", "fixed", "policy")
+_METHODS = ("default", "driver_specific", "pooled", "policy")
+_SHOWN = ("default", "pooled", "driver_specific", "policy")
 _OVER = "improvement_over"
 _AFTER_OVERRIDES = (_OVER, "rmse_speed_default")
 """The columns behind the overrides: the second, where no job has a policy."""
@@ -63,8 +63,10 @@ def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
     for folder, status in statuses.items():
         measured.append({} if status.code else metrics_of(folder))
     adapts = any("rmse_speed/policy" in found for found in measured)
-    are_calibrations = not adapts and any("rmse_speed/fixed" in found for found in measured)
-    judged = "fixed" if are_calibrations else "policy"
+    are_calibrations = not adapts and any(
+        "rmse_speed/driver_specific" in found for found in measured
+    )
+    judged = "driver_specific" if are_calibrations else "policy"
     table = []
     for (folder, status), own, found in zip(statuses.items(), given, measured, strict=True):
         row: dict[str, Any] = {"folder": folder.name}
@@ -103,7 +105,7 @@ def errors_of(statuses: Mapping[Path, JobStatus]) -> dict[str, pd.DataFrame]:
         name = " ".join(f"{key}={own.get(key, '')}" for key in differing)
         with suppress(OSError, ValueError):  # a job's files may have gone, or be damaged
             table = pd.read_csv(folder / "pairs.csv", usecols=_COMPARED)
-            own_method = "policy" if (table["method"] == "policy").any() else "fixed"
+            own_method = "policy" if (table["method"] == "policy").any() else "driver_specific"
             rows_of_it = table[table["method"] == own_method]
             alike.setdefault(name, []).append(rows_of_it.rename(columns={"rmse_speed": "error"}))
     found = {}
@@ -135,7 +137,7 @@ def summary_table(table: Sequence[Mapping[str, Any]], columns: Sequence[MetricIn
     methods = [
         one for one in _SHOWN if any(row.get(f"rmse_speed_{one}") is not None for row in table)
     ]
-    judged = "policy" if adapts else "fixed"
+    judged = "policy" if adapts else "driver_specific"
     headlines = [column for column in columns if column.headline]
     shown = blank_table(*(overrides or ["job"]), title="The sweep")
     if adapts:

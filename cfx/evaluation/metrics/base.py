@@ -197,7 +197,7 @@ ALWAYS = ("rmse_speed", "rmse_gap", "collisions")
 """Measured in every job: the comparison of methods, the figures and the reports rest on them."""
 
 _TAKEN = re.compile(
-    r"(steady|full_trajectory|real|improvement|parameter|rmse_improvement|platoon|history|labels)(_.*)?"
+    r"(steady|full_trajectory|real|improvement|parameter|platoon|history|labels)(_.*)?"
     r"|pair_id|recording|(leader|follower)_id|driver|cluster|style_score|fold|method|frames"
     r"|(train|validation)_loss|all"
 )

@@ -52,10 +52,10 @@ class AcrossDriversSettings(Settings):
         description="s that a pair must last to be tested; shorter ones are only learned from;"
         " null: all are tested",
     )
-    base: Literal["own", "population", "default"] = Field(
-        "own",
-        description="what a policy of offsets starts from for drivers with history: own:"
-        " driver-specific parameters; population: the pooled ones; default: the model's; for"
+    base: Literal["driver_specific", "pooled", "default"] = Field(
+        "driver_specific",
+        description="what a policy of offsets starts from for drivers with history:"
+        " driver_specific: their own parameters; pooled: the pooled ones; default: the model's; for"
         " drivers without history: the pooled ones, or the model's",
     )
     shrinkage: float = Field(
@@ -63,8 +63,8 @@ class AcrossDriversSettings(Settings):
         ge=0,
         le=1,
         description="how far driver-specific parameters, as such a base, are shrunk towards the"
-        " model's default (in the squashed space); 0: not at all. The baseline `fixed` is never"
-        " shrunk.",
+        " model's default (in the squashed space); 0: not at all. The baseline driver_specific is"
+        " never shrunk.",
     )
     history: float | None = Field(
         None,
@@ -97,15 +97,15 @@ class _Calibrated:
     """What calibration found; P pairs, K + 1 networks, n tuned parameters.
 
     Attributes:
-        fixed: driver-specific parameters, `(P, n)`, SI units.
-        population: pooled parameters of each network's pairs, `(K + 1, n)`.
+        driver_specific: driver-specific parameters, `(P, n)`, SI units.
+        pooled: pooled parameters of each network's pairs, `(K + 1, n)`.
         start: what each network starts from, `(K + 1, n)`.
         base: driver-specific base parameters, `(P, n)`; None: `start` for every driver.
         labels: per-window calibrated parameters; None if the learner needs none.
     """
 
-    fixed: Tensor
-    population: Tensor
+    driver_specific: Tensor
+    pooled: Tensor
     start: Tensor
     base: Tensor | None
     labels: WindowLabels | None
@@ -156,11 +156,11 @@ class AcrossDrivers(Protocol):
     """The paper's experiment on clusters: a policy is trained on some drivers and tested on others.
 
     The drivers are divided into k folds. For each fold a network is trained, and one parameter set,
-    `population`, is calibrated jointly, on the full trajectories of all other drivers. Then
-    default, population, the driver-specific parameters `fixed` (calibrated on the first 80 % of the
+    `pooled`, is calibrated jointly, on the full trajectories of all other drivers. Then
+    default, pooled, `driver_specific` (the driver's own set, calibrated on the first 80 % of the
     trajectory) and the policy are simulated over the last 20 % of each test trajectory. The policy
     observes the measured first part before (burn-in) and learns nothing from it. Default,
-    population and policy are also simulated over each full test trajectory, from its first frame.
+    pooled and policy are also simulated over each full test trajectory, from its first frame.
 
     All folds train as one batch of networks. One more network, `all`, learns from every driver. It
     is tested on no driver; the saved policy uses it for drivers of other recordings.
@@ -171,8 +171,8 @@ class AcrossDrivers(Protocol):
     into one fold, where even that cannot happen. `together=recording` asks the harder question:
     whether what was learned holds on another day, road or data set.
 
-    Differences from the paper: the paper's baseline is `population`; the driver-specific set
-    `fixed` is the stronger one. The paper does not say how folds are drawn; here a shuffle that
+    Differences from the paper: the paper's baseline is `pooled`; the driver's
+    own set is the stronger one. The paper does not say how folds are drawn; here a shuffle that
     `seed` determines draws them.
     """
 
@@ -197,14 +197,16 @@ class AcrossDrivers(Protocol):
         split[tested].check_test_parts(of_tested, context.windows, context.split)
         full = Split.none(pairs, context.windows)
         calibrator, batch = context.calibrator, context.batch
-        fixed = calibrator.fixed(pairs, batch, split.frame)
-        population = calibrator.population(pairs, batch, full.frame, members)
-        found = self._calibrated(context, fixed, population, context.labels(full.windows, fixed))
-        policy, training_result = self._learn(context, full, members, found)
-        calibration = context.calibration_metrics("fixed", split.frame, found.fixed)
-        calibration |= context.calibration_metrics(
-            "population", full.frame, found.population, members
+        driver_specific = calibrator.driver_specific(pairs, batch, split.frame)
+        pooled = calibrator.pooled(pairs, batch, full.frame, members)
+        found = self._calibrated(
+            context, driver_specific, pooled, context.labels(full.windows, driver_specific)
         )
+        policy, training_result = self._learn(context, full, members, found)
+        calibration = context.calibration_metrics(
+            "driver_specific", split.frame, found.driver_specific
+        )
+        calibration |= context.calibration_metrics("pooled", full.frame, found.pooled, members)
         return Trained(
             test=self._held_out(context, fold, split, found, policy),
             fold=fold[fold >= 0],
@@ -226,20 +228,20 @@ class AcrossDrivers(Protocol):
     def _calibrated(
         self,
         context: ProtocolContext,
-        fixed: Tensor,
-        population: Tensor,
+        driver_specific: Tensor,
+        pooled: Tensor,
         labels: WindowLabels | None,
     ) -> _Calibrated:
         """Returns what was calibrated, with what policies start from."""
         s = self.settings
-        start = population
+        start = pooled
         if s.base == "default":
-            start = context.defaults(population).expand_as(population)
+            start = context.defaults(pooled).expand_as(pooled)
         base = None
-        if s.base == "own":
+        if s.base == "driver_specific":
             space = context.stepper.model.adaptation_space
-            base = shrunk(space, fixed, s.shrinkage)
-        return _Calibrated(fixed, population, start, base, labels)
+            base = shrunk(space, driver_specific, s.shrinkage)
+        return _Calibrated(driver_specific, pooled, start, base, labels)
 
     def _learn(
         self, context: ProtocolContext, full: Split, members: Tensor, found: _Calibrated
@@ -250,18 +252,18 @@ class AcrossDrivers(Protocol):
         if not context.policy.trainable:
             training_result = context.untrained(context.policy, found.start)
             policy = context.ready(context.policy, training_result, names)
-            return replace(policy, population=found.population), training_result
+            return replace(policy, pooled=found.pooled), training_result
         self._warn(context)
         training_data = _training_data(context, full, members, found, names)
         training_result = context.learner.fit(context.policy, training_data)
         policy = context.ready(context.policy, training_result, names)
         rule = ContextRule(
-            driver_specific=s.base == "own",
-            shrinkage=s.shrinkage if s.base == "own" else 0.0,
+            driver_specific=s.base == "driver_specific",
+            shrinkage=s.shrinkage if s.base == "driver_specific" else 0.0,
             history_s=s.history,
             combines=s.combine,
         )
-        return replace(policy, context_rule=rule, population=found.population), training_result
+        return replace(policy, context_rule=rule, pooled=found.pooled), training_result
 
     def _warn(self, context: ProtocolContext) -> None:
         """Warns of settings that do not fit the learner's."""
@@ -291,7 +293,8 @@ class AcrossDrivers(Protocol):
     ) -> HeldOut:
         """Returns the test of the pairs that are tested in some fold."""
         tested = (fold >= 0).nonzero()[:, 0]
-        here, there = tested.to(context.batch.lengths.device), tested.to(found.fixed.device)
+        here = tested.to(context.batch.lengths.device)
+        there = tested.to(found.driver_specific.device)
         network = fold[tested]
         return HeldOut(
             context=context,
@@ -299,10 +302,10 @@ class AcrossDrivers(Protocol):
             batch=context.batch[here],
             network=network.to(here.device),
             first=split.frame[tested].to(here.device),
-            fixed=found.fixed[there],
+            driver_specific=found.driver_specific[there],
             base=None if found.base is None else found.base[there],
             unseen_base=found.start[network.to(found.start.device)],
-            population=found.population,
+            pooled=found.pooled,
             policy=policy,
         )
 
@@ -325,7 +328,7 @@ def _training_data(
         index=rows,
         split=full[index],
         network=network,
-        fixed=start,
+        start=start,
         base=base,
         labels=None if found.labels is None else found.labels.select(index),
         drivers=tuple(context.pairs[number].driver for number in index.tolist()),

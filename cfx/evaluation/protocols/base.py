@@ -142,7 +142,7 @@ class ProtocolContext:
         The metrics are called `calibration/OBJECTIVE/METHOD`.
 
         Args:
-            method: what the parameters are called in metrics: `fixed` or `population`.
+            method: what the parameters are called in metrics: `driver_specific` or `pooled`.
             last: `(P,)`, the last frame of each pair's calibrated part.
             parameters: `(P, n)`, one set per pair; with `members` `(K, n)`, one per group. SI
                 units.
@@ -212,8 +212,8 @@ class ProtocolContext:
 
         Args:
             policy: the component.
-            parameters: `(N, n)`, SI units: what `fixed` answers, and recurrent networks start from;
-                one network for each row.
+            parameters: `(N, n)`, SI units: what `policy=fixed` answers, and recurrent networks
+                start from; one network for each row.
         """
         names = tuple(str(number) for number in range(len(parameters)))
         return self.ready(policy, self.untrained(policy, parameters), names)

@@ -69,7 +69,7 @@ class FinishedPolicy:
         }
 
     def tested(self, context: ProtocolContext) -> Trained:
-        """Returns the test of all drivers of a recording, for which only `fixed` is calibrated.
+        """Returns the test of all drivers of a recording; only their own sets are calibrated.
 
         Raises:
             DataError: the policy has learned from some of the pairs, or drives in other steps.
@@ -80,24 +80,24 @@ class FinishedPolicy:
         policy = policy.to(device)
         split = Split.of(pairs, context.windows, context.split)
         split.check_test_parts(pairs, context.windows, context.split)
-        fixed = context.calibrator.fixed(pairs, batch, split.frame)
-        start, base = context.defaults(fixed)[None], None
+        driver_specific = context.calibrator.driver_specific(pairs, batch, split.frame)
+        start, base = context.defaults(driver_specific)[None], None
         if policy.base is not None:
-            start = policy.base.to(fixed.dtype)
+            start = policy.base.to(driver_specific.dtype)
             if policy.context_rule.driver_specific:
                 # Of the model alone: constant parameters of a driver are a baseline, `shrunk`.
-                base = base_of(policy, fixed)[:, : fixed.shape[1]]
-        population = policy.population
+                base = base_of(policy, driver_specific)[:, : driver_specific.shape[1]]
+        pooled = policy.pooled
         test = HeldOut(
             context=context,
             pairs=pairs,
             batch=batch,
             network=torch.zeros(len(pairs), dtype=torch.int64, device=device),
             first=split.frame.to(device),
-            fixed=fixed,
+            driver_specific=driver_specific,
             base=base,
             unseen_base=start.expand(len(pairs), -1),
-            population=None if population is None else population.to(fixed.dtype),
+            pooled=None if pooled is None else pooled.to(driver_specific.dtype),
             policy=policy,
         )
         notes = {
@@ -111,7 +111,9 @@ class FinishedPolicy:
             curves=pd.DataFrame(columns=CURVE_COLUMNS),
             labels=None,
             notes=notes,
-            calibration=context.calibration_metrics("fixed", split.frame, fixed),
+            calibration=context.calibration_metrics(
+                "driver_specific", split.frame, driver_specific
+            ),
         )
 
     def check(self, pairs: PairSet) -> None:

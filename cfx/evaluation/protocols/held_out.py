@@ -41,10 +41,10 @@ class HeldOut:
         network: which of the policy's N networks, and of the pooled sets, each pair is tested with,
             `(Q,)`.
         first: the last measured frame before the test part, `(Q,)`.
-        fixed: driver-specific parameters, `(Q, n)`, SI units.
+        driver_specific: driver-specific parameters, `(Q, n)`, SI units.
         base: driver-specific base parameters, `(Q, n)`; None: `unseen_base` for every driver.
         unseen_base: base parameters of drivers of whom nothing is known, `(Q, n)`.
-        population: pooled parameters, `(N, n)`; None if there are none.
+        pooled: pooled parameters, `(N, n)`; None if there are none.
         policy: what was learned.
     """
 
@@ -53,10 +53,10 @@ class HeldOut:
     batch: PairBatch
     network: Tensor
     first: Tensor
-    fixed: Tensor
+    driver_specific: Tensor
     base: Tensor | None
     unseen_base: Tensor
-    population: Tensor | None
+    pooled: Tensor | None
     policy: Agent
 
     @property
@@ -84,7 +84,7 @@ class HeldOut:
         loops = self._test_part(methods)
         tables = {}
         if self.policy.base is not None and histories:
-            tables["history"] = self.history(histories, loops["fixed"])
+            tables["history"] = self.history(histories, loops["driver_specific"])
         # A policy from elsewhere may know no drivers like these; their pasts say so.
         is_from_elsewhere = fold is None and self.policy.context_rule.history_s is None
         if self.combines or (is_from_elsewhere and self.policy.core.policy.trainable):
@@ -97,13 +97,13 @@ class HeldOut:
     def methods_without_history(self) -> dict[str, Agent]:
         """Returns the agents that need nothing of a test driver beforehand, by method."""
         context, networks = self.context, len(self.policy.names)
-        default = context.defaults(self.fixed).expand(networks, -1)
+        default = context.defaults(self.driver_specific).expand(networks, -1)
         methods = {
             "default": context.constant(DefaultPolicy(), default),
             "policy": self.policy,
         }
-        if self.population is not None:
-            methods["population"] = context.constant(FixedPolicy(), self.population)
+        if self.pooled is not None:
+            methods["pooled"] = context.constant(FixedPolicy(), self.pooled)
         return methods
 
     def _test_part(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
@@ -113,9 +113,9 @@ class HeldOut:
         for name, agent in methods.items():
             followers = self._followers(rule.history_s)
             if name == "policy" and self.combines:
-                followers = replace(followers, own=self.past.together_with(self.fixed))
+                followers = replace(followers, own=self.past.together_with(self.driver_specific))
             loops[name] = context.simulated(agent, followers, self.first)
-        loops["fixed"] = self._constant(self.fixed)
+        loops["driver_specific"] = self._constant(self.driver_specific)
         if self.base is not None and self.policy.base is not None and rule.shrinkage > 0:
             loops["shrunk"] = self._constant(self.base)
         return loops
@@ -132,13 +132,17 @@ class HeldOut:
         if self.combines:
             share, expected = past.weight, past.both
             alone = context.simulated(self.policy, self._followers(None), self.first)
-        loops = {"fixed": loops["fixed"], "alone": alone, "policy": loops["policy"]}
+        loops = {
+            "driver_specific": loops["driver_specific"],
+            "alone": alone,
+            "policy": loops["policy"],
+        }
         table = pd.DataFrame(
             {
                 "pair_id": self.pairs.ids,
                 "driver": self.pairs.drivers,
                 "share": share,
-                "past_rmse_speed_fixed": np.sqrt(past.fixed),
+                "past_rmse_speed_driver_specific": np.sqrt(past.driver_specific),
                 "past_rmse_speed_alone": np.sqrt(past.policy),
                 "past_rmse_speed_policy": expected,
             }
@@ -176,32 +180,32 @@ class HeldOut:
         agents: dict[str, tuple[Agent, Sequence[str]]] = {}
         for name, agent in methods.items():
             agents[name] = (agent, self.policy.names)
-        default = context.constant(DefaultPolicy(), context.defaults(self.fixed)[None])
+        default = context.constant(DefaultPolicy(), context.defaults(self.driver_specific)[None])
         agents["default"] = (default, ("any",))
         return measure_platoons(context.stepper.model, agents)
 
-    def history(self, histories: Sequence[float], fixed: ClosedLoop) -> pd.DataFrame:
+    def history(self, histories: Sequence[float], driver_specific: ClosedLoop) -> pd.DataFrame:
         """Simulates the test part after different amounts of history.
 
         Args:
             histories: s; besides them, all there is.
-            fixed: the simulation with driver-specific parameters.
+            driver_specific: the simulation with driver-specific parameters.
         """
         bases = {}
         if self.base is not None:
-            bases["own"] = self.base
-        bases["population"] = self.unseen_base
-        error_of_fixed, _ = closed_loop_errors(self.batch, self.first, fixed)
+            bases["driver_specific"] = self.base
+        bases["pooled"] = self.unseen_base
+        error_of_driver_specific, _ = closed_loop_errors(self.batch, self.first, driver_specific)
         tables = []
         for name, values in bases.items():
             for amount in (*sorted(histories), None):
-                table = self._after_history(values, amount, error_of_fixed)
+                table = self._after_history(values, amount, error_of_driver_specific)
                 table.insert(2, "base", name)
                 tables.append(table)
         return pd.concat(tables, ignore_index=True)
 
     def _after_history(
-        self, base: Tensor, amount: float | None, error_of_fixed: np.ndarray
+        self, base: Tensor, amount: float | None, error_of_driver_specific: np.ndarray
     ) -> pd.DataFrame:
         """Simulates the test part after one amount of history, s; None: all there is."""
         context = self.context
@@ -213,8 +217,13 @@ class HeldOut:
         if amount is not None:
             observed = np.minimum(observed, amount)
             text = f"{amount:g} s"
-        improvement = np.full_like(error_of_fixed, np.nan)
-        np.divide(error_of_fixed - speed, error_of_fixed, out=improvement, where=error_of_fixed > 0)
+        improvement = np.full_like(error_of_driver_specific, np.nan)
+        np.divide(
+            error_of_driver_specific - speed,
+            error_of_driver_specific,
+            out=improvement,
+            where=error_of_driver_specific > 0,
+        )
         return pd.DataFrame(
             {
                 "pair_id": self.pairs.ids,

@@ -53,13 +53,14 @@ class PastErrors:
             does: with the driver's acceleration if its head has a residual, `(D,)`, m2/s2.
         policy: of the policy that has observed the part before, `(D,)`, m2/s2.
         product: mean product of the two errors, `(D,)`, m2/s2.
-        fixed: mean square of the same parameters without that start, as the method `fixed`.
+        driver_specific: mean square of the same parameters without that start, as the method
+            `driver_specific`.
     """
 
     own: Array
     policy: Array
     product: Array
-    fixed: Array
+    driver_specific: Array
 
     @property
     def weight(self) -> Array:
@@ -115,7 +116,7 @@ def past_errors(
         first, cut, network = first[rows], cut[rows], followers.network[rows]
         assert followers.base is not None
         base, batch = followers.base[rows], batch[rows].until(first)
-        early = context.calibrator.fixed(pairs, batch, cut.cpu()).to(base)
+        early = context.calibrator.driver_specific(pairs, batch, cut.cpu()).to(base)
         if policy.base is not None and policy.context_rule.driver_specific:
             base = base_of(policy, early)[:, : early.shape[1]]
         each = torch.arange(len(rows), device=rows.device)
@@ -126,13 +127,18 @@ def past_errors(
             return _speed_errors(context.simulated(agent, followers, cut), batch, cut)
 
         of_policy = errors(policy, Followers(batch, network, base))
-        of_fixed = errors(context.constant(FixedPolicy(), early), Followers(batch, each))
-        own = of_fixed
+        of_driver_specific = errors(context.constant(FixedPolicy(), early), Followers(batch, each))
+        own = of_driver_specific
         if residual:
             start = context.constant(FixedPolicy(residual=True), early)
             own = errors(start, Followers(batch, each))
         frames = (first - cut).to(own)
-        products = (own * own, of_policy * of_policy, own * of_policy, of_fixed * of_fixed)
+        products = (
+            own * own,
+            of_policy * of_policy,
+            own * of_policy,
+            of_driver_specific * of_driver_specific,
+        )
         for row, product in zip(found, products, strict=True):
             row[numbers] = (product.sum(1) / frames).cpu().numpy()
     return PastErrors(*found)
@@ -143,11 +149,11 @@ def expected_error(table: pd.DataFrame, fold: NDArray[np.int64]) -> ExpectedErro
 
     Args:
         table: a row per driver, with `rmse_speed_METHOD` and `past_rmse_speed_METHOD`, m/s, of
-            `policy` and `fixed`.
+            `policy` and `driver_specific`.
         fold: in which fold each was tested, `(D,)`; each fold counts once.
     """
     factors = []
-    for method in ("policy", "fixed"):
+    for method in ("policy", "driver_specific"):
         past = table[f"past_rmse_speed_{method}"]
         growth = table[f"rmse_speed_{method}"] / past.where(past > 0)
         factors.append(conformal_bound(growth.to_numpy(dtype=np.float64), fold))
@@ -164,17 +170,19 @@ def expected_of_unseen(
         fold: in which fold each was tested, `(D,)`; each fold counts once.
         found: what their pasts say.
     """
-    if not {"policy", "population"} <= set(speed):
+    if not {"policy", "pooled"} <= set(speed):
         return found
     policy, constant = (
         conformal_bound(speed[method].to_numpy(dtype=np.float64), fold)
-        for method in ("policy", "population")
+        for method in ("policy", "pooled")
     )
     return replace(found, unseen=policy, unseen_constant=constant)
 
 
 def with_bounds(table: pd.DataFrame, expected: ExpectedError | None) -> pd.DataFrame:
-    """Adds `bound_policy` and `bound_fixed`: what 90 % of drivers' errors stay below, m/s.
+    """Adds what 90 % of drivers' errors stay below, m/s.
+
+    The columns are `bound_policy` and `bound_driver_specific`.
 
     Args:
         table: as of `expected_error`.
@@ -182,7 +190,7 @@ def with_bounds(table: pd.DataFrame, expected: ExpectedError | None) -> pd.DataF
     """
     expected = expected or ExpectedError()
     bounds = {}
-    for method, factor in (("policy", expected.policy), ("fixed", expected.own)):
+    for method, factor in (("policy", expected.policy), ("driver_specific", expected.own)):
         times = math.nan if factor is None else factor
         bounds[f"bound_{method}"] = times * table[f"past_rmse_speed_{method}"]
     return table.assign(**bounds)

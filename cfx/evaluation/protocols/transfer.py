@@ -28,12 +28,12 @@ class Transfer(Protocol):
     Model, policy and windows are that job's, whatever else is chosen. Its network for unseen
     drivers (`all`, or the only one) is tested as its protocol tested it: from driver-specific base
     parameters or from the pooled ones, after as much history. The baselines are the model's default
-    parameters, `population` (constant parameters that were calibrated on the drivers that the
+    parameters, `pooled` (constant parameters that were calibrated on the drivers that the
     policy learned from, where there are any), and the driver-specific parameters, from the first 80
-    % of each trajectory here. All are tested on the last 20 %; default, population and policy also
+    % of each trajectory here. All are tested on the last 20 %; default, pooled and policy also
     on each full trajectory.
 
-    So all that `default`, `population` and `policy` know comes from elsewhere: what remains of
+    So all that `default`, `pooled` and `policy` know comes from elsewhere: what remains of
     their gains is what transfers to another day, road or country. (To calibrate and train on some
     recordings and test on others of the same data, see `across_drivers` with `together=recording`.
     To forecast the drivers with that policy, or to set them on roads: `protocol.run` of `forecast`

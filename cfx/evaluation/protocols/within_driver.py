@@ -59,35 +59,37 @@ class WithinDriver(Protocol):
             )
         else:
             split.check_test_parts(pairs, context.windows, context.split)
-        fixed = context.calibrator.fixed(pairs, batch, split.frame)
-        labels = context.labels(split.windows, fixed)
+        driver_specific = context.calibrator.driver_specific(pairs, batch, split.frame)
+        labels = context.labels(split.windows, driver_specific)
         network, names = self._networks(context)
         if context.policy.trainable:
             training_pairs = TrainingPairs(
                 index=torch.arange(len(batch), device=batch.lengths.device),
                 split=split,
                 network=network,
-                fixed=fixed,
-                base=fixed if self.settings.networks == "all" else None,
+                start=driver_specific,
+                base=driver_specific if self.settings.networks == "all" else None,
                 labels=labels,
                 drivers=tuple(pairs.drivers),
             )
             training_data = context.training_data(training_pairs, names)
             training_result = context.learner.fit(context.policy, training_data)
         else:
-            training_result = context.untrained(context.policy, fixed)
+            training_result = context.untrained(context.policy, driver_specific)
         policy = context.ready(context.policy, training_result, names)
         first = (split.frame * (not whole)).to(batch.lengths.device)
-        scopes = {"test": _test_part(context, policy, network, first, fixed)}
+        scopes = {"test": _test_part(context, policy, network, first, driver_specific)}
         tested = ComparedPairs(pairs, batch, first, context.style)
-        platoon = self._platoons(context, policy, fixed)
+        platoon = self._platoons(context, policy, driver_specific)
         evaluation = context.compared(tested, scopes, policy, platoon)
         return ProtocolResult(
             evaluation,
             policy,
             training_result.curves,
             labels,
-            calibration=context.calibration_metrics("fixed", split.frame, fixed),
+            calibration=context.calibration_metrics(
+                "driver_specific", split.frame, driver_specific
+            ),
         )
 
     def _networks(self, context: ProtocolContext) -> tuple[Tensor, tuple[str, ...]]:
@@ -99,26 +101,28 @@ class WithinDriver(Protocol):
         network = torch.arange(len(pairs), device=device)
         return network, tuple(pairs.ids)
 
-    def _platoons(self, context: ProtocolContext, policy: Agent, fixed: Tensor) -> Platoon | None:
+    def _platoons(
+        self, context: ProtocolContext, policy: Agent, driver_specific: Tensor
+    ) -> Platoon | None:
         """Simulates platoons where one network drives any driver; otherwise None."""
         if self.settings.networks != "all" or not context.policy.trainable:
             return None
-        default = context.constant(DefaultPolicy(), fixed[:1])
+        default = context.constant(DefaultPolicy(), driver_specific[:1])
         agents = {"default": (default, ("any",)), "policy": (policy, policy.names)}
         return measure_platoons(context.stepper.model, agents)
 
 
 def _test_part(
-    context: ProtocolContext, policy: Agent, network: Tensor, first: Tensor, fixed: Tensor
+    context: ProtocolContext, policy: Agent, network: Tensor, first: Tensor, driver_specific: Tensor
 ) -> dict[str, ClosedLoop]:
     """Simulates the test part of P pairs, from frames `first` `(P,)` on, by all methods."""
-    default = context.constant(DefaultPolicy(), fixed)
-    constant = context.constant(FixedPolicy(), fixed)
+    default = context.constant(DefaultPolicy(), driver_specific)
+    constant = context.constant(FixedPolicy(), driver_specific)
     each = torch.arange(len(first), device=first.device)
     alone = Followers(context.batch, each)
-    learned = Followers(context.batch, network, base=fixed)
+    learned = Followers(context.batch, network, base=driver_specific)
     return {
         "default": context.simulated(default, alone, first),
-        "fixed": context.simulated(constant, alone, first),
+        "driver_specific": context.simulated(constant, alone, first),
         "policy": context.simulated(policy, learned, first),
     }

@@ -220,12 +220,12 @@ class RolloutDataset:
         recorded, row = _recorded_once(training_data)
         batch = _single_precision(training_data.recorded, training_data.pairs.index[recorded])
         device = batch.lengths.device
-        space, fixed = head.space, head.completed(training_data.pairs.fixed)
+        space, start = head.space, head.completed(training_data.pairs.start)
         grid = Grid(training_data.pairs.network.to(device), len(training_data.names))
         pairs = torch.arange(len(row), device=device)
         pair = grid.scatter(pairs).repeat_interleave(ensemble_size, 0)
         present = grid.scatter(torch.ones_like(pairs)).bool().repeat_interleave(ensemble_size, 0)
-        pooled = grid.mean(space.to_unit(fixed)).float()
+        pooled = grid.mean(space.to_unit(start)).float()
         last = training_data.pairs.split.frame.to(device)[pair]
         validation = settings.validation
         kept, few = _validation_drivers(
@@ -234,7 +234,7 @@ class RolloutDataset:
         kept, few = kept.to(device), few.to(device)[:, None]
         trains = present & (few | ~kept)
         until = torch.where(few, (last * (1.0 - validation)).long(), last)
-        bases = fixed
+        bases = start
         if training_data.pairs.base is not None:
             bases = head.completed(training_data.pairs.base)
         base = space.to_unit(bases).float()

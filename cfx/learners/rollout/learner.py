@@ -141,7 +141,7 @@ class RolloutLearner(Learner):
             network=network.eval(),
             scaler=Scaler(dataset.scaler.mean[first].clone(), dataset.scaler.scale[first].clone()),
             curves=curves,
-            base=head.space.from_unit(dataset.pooled[first].to(training_data.pairs.fixed.dtype)),
+            base=head.space.from_unit(dataset.pooled[first].to(training_data.pairs.start.dtype)),
             head=head.name,
             valid_range=valid_range,
             dispersion=dispersion,

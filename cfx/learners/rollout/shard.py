@@ -252,7 +252,7 @@ def _without_pairs(training_data: TrainingData) -> TrainingData:
             index=pairs.index[:0],
             split=pairs.split[:0],
             network=pairs.network[:0],
-            fixed=pairs.fixed[:0],
+            start=pairs.start[:0],
             base=base,
         ),
         workspace=None,
@@ -265,8 +265,8 @@ def _expert(shard: TrainingShard, weights: dict[str, Tensor]) -> TrainingShard:
     s, stepper = shard.settings, MemoryStepper(Direct(), shard.training_data.stepper.dt)
     epochs = s.epochs - s.distillation_epochs
     changes = {"head": OffsetHead.name, "distillation_epochs": 0, "epochs": epochs}
-    space, fixed = stepper.model.adaptation_space, shard.training_data.pairs.fixed
-    default = space.to_unit(space.defaults(dtype=fixed.dtype, device=fixed.device)).float()
+    space, start = stepper.model.adaptation_space, shard.training_data.pairs.start
+    default = space.to_unit(space.defaults(dtype=start.dtype, device=start.device)).float()
     checkpoint = shard.checkpoint
     if checkpoint is not None:
         checkpoint = expert_checkpoint(checkpoint)

@@ -58,7 +58,7 @@ def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingD
     network = torch.arange(networks, device=device).repeat_interleave(count)
     # All recorded pairs of a network start from its pooled set.
     first = torch.searchsorted(pairs.network, network)
-    pooled = pairs.fixed[first.to(pairs.fixed.device)]
+    pooled = pairs.start[first.to(pairs.start.device)]
     order = torch.cat([pairs.network, network]).argsort(stable=True)
 
     def joined(recorded: Tensor, simulated: Tensor) -> Tensor:
@@ -83,7 +83,7 @@ def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingD
                 joined(pairs.split.windows, whole.windows.to(added.device)[added]),
             ),
             network=joined(pairs.network, network),
-            fixed=joined(pairs.fixed, pooled),
+            start=joined(pairs.start, pooled),
             base=base,
             drivers=named(pairs.known_drivers, names),
             sites=named(sites, [SITE] * count),

@@ -146,7 +146,7 @@ def improvement_bars(
     pair_ids: Sequence[Sequence[str]],
     improvements: Sequence[canvas.Array],
     *,
-    baseline: str = "fixed",
+    baseline: str = "driver_specific",
     marks: Sequence[float] = (),
 ) -> ImprovementBars:
     """Chooses the bars of every pair, best to worst in each job.
@@ -226,7 +226,7 @@ def draw_improvements(bars: ImprovementBars, summary: Improvement) -> Figure:
 def _bars(axes: Axes, series: ImprovementSeries, low: float) -> None:
     places = np.arange(len(series.values))
     bar_colours = np.where(
-        series.values > 0, colours.COLOURS["policy"], colours.COLOURS["fixed"]
+        series.values > 0, colours.COLOURS["policy"], colours.COLOURS["driver_specific"]
     ).tolist()
     drawn = axes.bar(places, series.shown, width=0.82, color=bar_colours)
     for bar, pair, value in zip(drawn, series.pair_ids, series.values, strict=True):
@@ -258,8 +258,8 @@ def _closer(series: ImprovementSeries) -> list[Line2D | Patch]:
     return [
         Patch(color=colours.COLOURS["policy"], label=f"policy closer to the driver: {policy}"),
         Patch(
-            color=colours.COLOURS["fixed"],
-            label=f"{wording.method_label('fixed')} closer, or equal: {others}",
+            color=colours.COLOURS["driver_specific"],
+            label=f"{wording.method_label('driver_specific')} closer, or equal: {others}",
         ),
     ]
 
@@ -309,19 +309,19 @@ class ImprovementPerDriver(JobFigure):
 
     def draw(self, result: Result) -> Figure | None:
         """Draws it where a policy adapts."""
-        if "fixed" not in result.improvements:
+        if "driver_specific" not in result.improvements:
             return None
-        return draw_improvement(result, "fixed", "improvement")
+        return draw_improvement(result, "driver_specific")
 
 
-def draw_improvement(result: Result, baseline: str, column: str) -> Figure:
-    """Draws the improvement of every pair over a baseline, which `column` of the pairs holds."""
+def draw_improvement(result: Result, baseline: str) -> Figure:
+    """Draws the improvement of every pair over a baseline."""
     rows = result.pairs[result.pairs["method"] == "policy"]
     summary = result.improvements[baseline]
     bars = improvement_bars(
         [""],
         [rows["pair_id"].astype(str).tolist()],
-        [rows[column].to_numpy(dtype=float)],
+        [rows[f"improvement_over_{baseline}"].to_numpy(dtype=float)],
         baseline=baseline,
         marks=(summary.geometric, summary.ci95_low, summary.ci95_high),
     )

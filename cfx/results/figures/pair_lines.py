@@ -437,8 +437,8 @@ def drives(result: Result, pair_id: str | Sequence[str] | None = None, count: in
         name = RankedPair(wording.shortened(ranked.pair_id), ranked.rank, ranked.improvement).title
         if np.isfinite(ranked.improvement):
             name += f":  {wording.percent(ranked.improvement)}"
-            explained = f"percentages: {improvement_title('fixed')}"
-        elif {"fixed", "policy"} <= set(result.shown_methods):
+            explained = f"percentages: {improvement_title('driver_specific')}"
+        elif {"driver_specific", "policy"} <= set(result.shown_methods):
             name += ":  improvement undefined"
         speed = _errors_text(result, trajectory.pair_id, "speed", "m/s")
         titles.append((name, speed, _errors_text(result, trajectory.pair_id, "gap", "m")))
@@ -512,8 +512,8 @@ def chosen_pairs(
     rows = rows[rows["pair_id"].isin(list(by_id))]
     gains = pd.Series(np.nan, index=rows["pair_id"].astype(str))
     # Without driver-specific calibration there is nothing to be better than.
-    if "improvement" in rows and not is_calibration:
-        gains[:] = rows["improvement"].to_numpy(dtype=float)
+    if "improvement_over_driver_specific" in rows and not is_calibration:
+        gains[:] = rows["improvement_over_driver_specific"].to_numpy(dtype=float)
     if pair_id is None:
         values = gains.to_numpy(dtype=float)
         if is_calibration:

@@ -78,10 +78,10 @@ def parameter_spreads(
         column = f"parameter_{axis.name}"
         if column not in table or axis.low is None or axis.high is None or axis.high <= axis.low:
             continue
-        values = _known(table, "fixed", column)
+        values = _known(table, "driver_specific", column)
         default = _known(table, "default", column)
         if len(values) and len(default):
-            pooled = np.unique(_known(table, "population", column))
+            pooled = np.unique(_known(table, "pooled", column))
             found.append(ParameterSpread(axis, values, pooled, float(default[0])))
     return tuple(found)
 
@@ -109,7 +109,7 @@ def correlations(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> pd.DataF
     for axis in axes:
         if f"parameter_{axis.name}" in table:
             columns[f"parameter_{axis.name}"] = axis.name
-    rows = table.loc[table["method"] == "fixed", list(columns)].rename(columns=columns)
+    rows = table.loc[table["method"] == "driver_specific", list(columns)].rename(columns=columns)
     return rows.astype(float).corr("spearman")
 
 
@@ -140,16 +140,22 @@ def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
         places = spread.places(spread.values)
         named = {
             method: wording.method_label(method) if row == 0 else ""
-            for method in ("fixed", "default")
+            for method in ("driver_specific", "default")
         }
         aside = row + _WIDTH * spread_offsets(len(places))
-        dots: dict[str, Any] = {"alpha": 0.55, "markeredgewidth": 0, "label": named["fixed"]}
-        canvas.draw_points(axes, places, aside, "o", colours.colour_of("fixed"), 3.2, **dots)
+        dots: dict[str, Any] = {
+            "alpha": 0.55,
+            "markeredgewidth": 0,
+            "label": named["driver_specific"],
+        }
+        canvas.draw_points(
+            axes, places, aside, "o", colours.colour_of("driver_specific"), 3.2, **dots
+        )
         pooled = spread.places(spread.pooled)
-        said = wording.method_label("population") if row == 0 and len(pooled) else ""
+        said = wording.method_label("pooled") if row == 0 and len(pooled) else ""
         rows_of_it = np.full(len(pooled), row)
         canvas.draw_points(
-            axes, pooled, rows_of_it, "D", colours.colour_of("population"), 6, label=said
+            axes, pooled, rows_of_it, "D", colours.colour_of("pooled"), 6, label=said
         )
         default, bar = spread.places(np.array([spread.default])), {"markeredgewidth": 2.2}
         canvas.draw_points(

@@ -34,7 +34,7 @@ JOBS = 3
 COMPARED = 10
 """Most jobs on one page that compares them side by side; the best of a larger sweep."""
 
-IMPROVEMENT = "metrics.`rmse_improvement/geometric`"
+IMPROVEMENT = "metrics.`improvement/rmse_speed/driver_specific/geometric`"
 """What the tables of jobs are sorted by."""
 
 _COLUMNS = (
@@ -46,7 +46,7 @@ _COLUMNS = (
     f"metrics.`{SPEED_ERROR}`",
     "metrics.`collisions/policy`",
     IMPROVEMENT,
-    "metrics.`rmse_speed/fixed`",
+    "metrics.`rmse_speed/driver_specific`",
     "metrics.`rmse_speed/default`",
     "tags.`protocol`",
     "tags.`data`",
@@ -65,7 +65,7 @@ _WIDTHS = {
 }
 """Pixels of columns that need more or less than MLflow gives them."""
 
-_CHARTS = f"{PERCENT}|{SPEED_ERROR}|rmse_improvement/geometric|rmse_speed/"
+_CHARTS = f"{PERCENT}|{SPEED_ERROR}|improvement/rmse_speed/driver_specific/geometric|rmse_speed/"
 """Metrics that MLflow's charts show, a regular expression."""
 
 _SECTION = "cfx"
@@ -274,7 +274,7 @@ def _improvements(runs: Sequence[Any]) -> list[float]:
     """Returns the improvements of those runs that have one."""
     values = []
     for run in runs:
-        value = run.data.metrics.get("rmse_improvement/geometric", math.nan)
+        value = run.data.metrics.get("improvement/rmse_speed/driver_specific/geometric", math.nan)
         if math.isfinite(value):
             values.append(value)
     return values
@@ -352,7 +352,7 @@ def _began(run: Any) -> str:
 
 def _improvement(run: Any, which: str = "") -> str:
     """Returns a run's improvement in words; how the run ended if it has none."""
-    value = run.data.metrics.get("rmse_improvement/geometric")
+    value = run.data.metrics.get("improvement/rmse_speed/driver_specific/geometric")
     if value is None or math.isnan(value):
         return f", {run.info.status}"
     return f", {which}improvement {value:.1%}"

@@ -361,7 +361,7 @@ def _fitted(result: Result) -> dict[str, float]:
     if "fits" not in result.tables:
         return {}
     fits = result.tables["fits"]
-    means = fits[fits["method"] == "fixed"].mean(numeric_only=True)
+    means = fits[fits["method"] == "driver_specific"].mean(numeric_only=True)
     return fitted_errors({str(name).removeprefix("train_"): mean for name, mean in means.items()})
 
 
@@ -423,7 +423,7 @@ def sweep_link(experiment_id: str, sweep: str) -> str:
         "searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'",
         # Sorted by date, MLflow's page would fold the jobs away under their parent, and draw no
         # charts.
-        "orderByKey": "metrics.`rmse_improvement/geometric`",
+        "orderByKey": "metrics.`improvement/rmse_speed/driver_specific/geometric`",
         "orderByAsc": "false",
         "compareRunsMode": "CHART",
         "workflowType": "machine_learning",

@@ -213,7 +213,7 @@ def test_recalibration_is_the_calibration_of_the_latest_history() -> None:
         Solver(MemoryStepper(Krauss(), 0.1), GradientSearch(samples=512), seed=0, memory=1 << 28),
         cache=Cache(None),
     )
-    found = calibrator.fixed(latest, PairBatch.of(latest), torch.full((3,), kept - 1))
+    found = calibrator.driver_specific(latest, PairBatch.of(latest), torch.full((3,), kept - 1))
     torch.testing.assert_close(loop.parameters[:, -1], found, atol=1e-3, rtol=1e-3)
 
 

@@ -240,4 +240,4 @@ def test_a_job_runs_with_the_preset_for_city_traffic(tmp_path, monkeypatch) -> N
         "optimizer.samples=64",
     ]
     result = cfx.run([*overrides, "policy=fixed", "tracking.enabled=false", "figures=none"])
-    assert math.isfinite(result.metrics["rmse_speed/fixed"])
+    assert math.isfinite(result.metrics["rmse_speed/driver_specific"])

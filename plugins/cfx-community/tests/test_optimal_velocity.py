@@ -177,4 +177,4 @@ def test_a_job_runs_with_the_preset_for_city_traffic(tmp_path, monkeypatch) -> N
     ]
     overrides += ["protocol=within_driver", "data=synthetic"]
     result = cfx.run([*overrides, "policy=fixed", "tracking.enabled=false", "figures=none"])
-    assert math.isfinite(result.metrics["rmse_speed/fixed"])
+    assert math.isfinite(result.metrics["rmse_speed/driver_specific"])

@@ -32,7 +32,11 @@ def test_cfx_recovers_known_drivers(
         ]
     )
     truth = cfx.get("dataset", "synthetic")(pairs=3, platoon_size=1, variation=0, frames=400).load()
-    calibrated = result.pairs[result.pairs.method == "fixed"].set_index("pair_id").parameter_t_r
+    calibrated = (
+        result.pairs[result.pairs.method == "driver_specific"].set_index("pair_id").parameter_t_r
+    )
     for pair in truth:
         assert calibrated[pair.pair_id] == pytest.approx(pair.truth["t_r"][0], abs=0.05)
-    assert result.metrics["rmse_speed/fixed"] < 0.01 * result.metrics["rmse_speed/default"]
+    assert (
+        result.metrics["rmse_speed/driver_specific"] < 0.01 * result.metrics["rmse_speed/default"]
+    )

@@ -69,7 +69,7 @@ def training_data(
             index=torch.arange(PAIRS),
             split=split,
             network=network,
-            fixed=model.space.from_unit((model.space.to_unit(truth) + 0.25).clamp(0.05, 0.95)),
+            start=model.space.from_unit((model.space.to_unit(truth) + 0.25).clamp(0.05, 0.95)),
             labels=_labels(split, truth) if needs_labels else None,
         ),
         windows=WINDOWS,
@@ -145,7 +145,7 @@ def learns_something(learner: Learner) -> None:
     result = _fitted(learner, data)
     head = _head(result, data)
     default = head.space.to_unit(head.space.defaults()).float()
-    start = head.untrained_answer(head.space.to_unit(data.pairs.fixed).float())
+    start = head.untrained_answer(head.space.to_unit(data.pairs.start).float())
     features = features_read(_POLICY, head, WINDOWS.length)
     untrained = _POLICY.build(features, default, start, torch.Generator().manual_seed(0)).eval()
     before = _rmse(replace(result, network=untrained), data)
@@ -233,7 +233,7 @@ def the_training_data_stays_as_it_is(learner: Learner) -> None:
     for name in (*RECORDED, "gap"):
         one, two = getattr(data.recorded, name), getattr(untouched.recorded, name)
         assert torch.equal(one, two), f"recorded.{name} of the training data {message}"
-    for name in ("fixed", "network"):
+    for name in ("start", "network"):
         one, two = getattr(data.pairs, name), getattr(untouched.pairs, name)
         assert torch.equal(one, two), f"{name} of the training data {message}"
     if data.pairs.labels is not None and untouched.pairs.labels is not None:

@@ -38,7 +38,7 @@ PAIRS, FRAMES = 6, 111
 
 _COLUMNS = (
     "pair_id", "recording", "leader_id", "follower_id", "driver", "cluster", "style_score", "fold",
-    "method", "frames", "rmse_speed", "rmse_gap", "improvement", "collisions",
+    "method", "frames", "rmse_speed", "rmse_gap", "improvement_over_driver_specific", "collisions",
 )  # fmt: skip
 
 
@@ -108,7 +108,7 @@ def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
     assert not missing, (
         f"reports, figures and `cfx report` read these columns of the table: {', '.join(missing)}"
     )
-    assert {"default", "fixed", "policy"} <= set(evaluation.methods), (
+    assert {"default", "driver_specific", "policy"} <= set(evaluation.methods), (
         "the policy is compared with the model's defaults and with driver-specific parameters;"
         f" there are only {', '.join(evaluation.methods)}"
     )
@@ -186,9 +186,9 @@ def learners_get_only_what_they_may_use(protocol: Protocol) -> None:
     assert watched.training_data_seen, "a trainable policy must be trained by the context's learner"
     for training_data in watched.training_data_seen:
         pairs = training_data.pairs
-        per_pair = (pairs.split.frame, pairs.network, pairs.fixed)
+        per_pair = (pairs.split.frame, pairs.network, pairs.start)
         assert all(len(values) == len(pairs) for values in per_pair), (
-            "split, network and fixed of training data have an entry for each of its pairs"
+            "split, network and start of training data have an entry for each of its pairs"
         )
         assert bool((pairs.split.frame < training_data.recorded.lengths[pairs.index]).all()), (
             "`split.frame` is a frame of the pair"

@@ -45,7 +45,7 @@ class Plain(Learner):
         network_of, names = training_data.pairs.network, training_data.names
         grid, mask, wanted = (self.arrange(x, network_of, len(names)) for x in (seen, mask, wanted))
         scaler = self.scaler(grid, mask)
-        start = space.to_unit(training_data.pairs.fixed).float()
+        start = space.to_unit(training_data.pairs.start).float()
         first = torch.stack([start[network_of == k].mean(0) for k in range(len(names))])
         network = policy.build(grid.shape[-1], first[0], first, torch_seed)
         rows = self.train(network, scaler(grid), wanted, mask)
@@ -165,7 +165,7 @@ class Meddling(Plain):
     def finish(
         self, training_result: TrainingResult, training_data: TrainingData
     ) -> TrainingResult:
-        training_data.pairs.fixed.mul_(1.01)
+        training_data.pairs.start.mul_(1.01)
         return training_result
 
 

@@ -66,7 +66,10 @@ class Double(Retelling):
 class Mute(Retelling):
     def retell(self, evaluation: Evaluation) -> Evaluation:
         return replace(
-            evaluation, improvements={"test": {"fixed": evaluation.improvements["test"]["fixed"]}}
+            evaluation,
+            improvements={
+                "test": {"driver_specific": evaluation.improvements["test"]["driver_specific"]}
+            },
         )
 
 
@@ -79,8 +82,8 @@ class _Whole:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._calibrator, name)
 
-    def fixed(self, pairs: Any, batch: Any, last: Any) -> Any:
-        return self._calibrator.fixed(pairs, batch, batch.lengths - 1)
+    def driver_specific(self, pairs: Any, batch: Any, last: Any) -> Any:
+        return self._calibrator.driver_specific(pairs, batch, batch.lengths - 1)
 
 
 class Peeking(WithinDriver):
@@ -97,7 +100,7 @@ class _Telling(ImitationLearner):
 
     def fit(self, policy: Policy, training_data: TrainingData) -> TrainingResult:
         whole = Split.none(self._context.pairs, self._context.windows)
-        labels = self._context.labels(whole.windows, training_data.pairs.fixed)
+        labels = self._context.labels(whole.windows, training_data.pairs.start)
         told = replace(training_data, pairs=replace(training_data.pairs, labels=labels))
         return self._learner.fit(policy, told)
 
@@ -151,7 +154,7 @@ BROKEN: dict[str, tuple[Protocol, Any, str]] = {
     "peeking": (
         Peeking(),
         checks.nothing_is_found_or_learned_from_the_test_part,
-        "method 'fixed' begins",
+        "method 'driver_specific' begins",
     ),
     "telling": (
         Telling(),

@@ -10,7 +10,7 @@ import argparse
 
 from cfx.plugin import Command
 
-IMPROVEMENT = "rmse_improvement/mean"
+IMPROVEMENT = "improvement/rmse_speed/driver_specific/geometric"
 
 
 class Gains(Command):

@@ -24,11 +24,11 @@ class DriverJson(ExportFormat):
         pairs = stored_tables(folder).get("pairs")
         if pairs is None:
             raise DataError(f"{folder} holds no pairs.csv; give the output folder of a job")
-        fixed = pairs[pairs["method"] == "fixed"].set_index("pair_id").filter(like=PREFIX)
+        fixed = pairs[pairs["method"] == "driver_specific"].set_index("pair_id").filter(like=PREFIX)
         fixed = fixed.dropna(axis="columns", how="all").dropna()
         if fixed.empty:
             raise DataError(
-                f"{folder}/pairs.csv holds no driver-specific parameters (method fixed); give a"
+                f"{folder}/pairs.csv holds no driver-specific parameters; give a"
                 " job that calibrated some"
             )
         drivers = fixed.rename(columns=lambda name: name.removeprefix(PREFIX)).to_dict("index")

@@ -19,12 +19,12 @@ class PolicyErrors(JobFigure):
     )
 
     def draw(self, result: Result) -> Figure | None:
-        if not {"policy", "fixed"} <= set(result.shown_methods):
+        if not {"policy", "driver_specific"} <= set(result.shown_methods):
             return None
         errors = result.pairs.pivot(index="pair_id", columns="method", values="rmse_speed")
         figure = canvas.blank(3.9)
         axes = figure.subplots()
-        axes.scatter(errors["fixed"], errors["policy"])
+        axes.scatter(errors["driver_specific"], errors["policy"])
         axes.axline((0, 0), slope=1, color="0.5", linewidth=1)
         axes.set_xlabel("RMSE of speed, constant parameters (m/s)")
         axes.set_ylabel("policy (m/s)")

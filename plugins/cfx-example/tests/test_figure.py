@@ -9,7 +9,7 @@ from cfx_example.figure import PolicyErrors
 ERRORS = pd.DataFrame(
     {
         "pair_id": ["a", "a", "b", "b"],
-        "method": ["fixed", "policy"] * 2,
+        "method": ["driver_specific", "policy"] * 2,
         "rmse_speed": [0.5, 0.25, 0.75, 1.0],
     }
 )
@@ -28,5 +28,5 @@ def test_each_pair_is_a_point():
 
 
 def test_a_job_without_a_policy_has_none():
-    only_fixed = ERRORS[ERRORS["method"] == "fixed"]
+    only_fixed = ERRORS[ERRORS["method"] == "driver_specific"]
     assert PolicyErrors().draw(Result(tables={"pairs": only_fixed})) is None

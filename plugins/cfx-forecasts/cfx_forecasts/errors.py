@@ -23,10 +23,10 @@ FORECAST_METHODS = (
     "constant_speed",
     "constant_acceleration",
     "default",
-    "population",
-    "population_residual",
-    "fixed",
-    "fixed_residual",
+    "pooled",
+    "pooled_residual",
+    "driver_specific",
+    "driver_specific_residual",
     "policy",
 )
 """What forecasts compare, in the order in which it is shown."""

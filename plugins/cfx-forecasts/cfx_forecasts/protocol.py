@@ -81,10 +81,10 @@ class Forecast(FoldsOrFinished):
 
     - `constant_speed`, `constant_acceleration`: the driver goes on as at the origin;
     - `default`: the model's default parameters;
-    - `population`: pooled parameters, calibrated on the drivers of the other folds;
-    - `fixed`: driver-specific parameters, calibrated on the driver's trajectory up to their first
-      origin: what every origin may read, and nothing after it;
-    - `population_residual`, `fixed_residual`: the same with a residual: they start with the
+    - `pooled`: pooled parameters, calibrated on the drivers of the other folds;
+    - `driver_specific`: driver-specific parameters, calibrated on the driver's trajectory up to
+      their first origin: what every origin may read, and nothing after it;
+    - `pooled_residual`, `driver_specific_residual`: the same with a residual: they start with the
       acceleration and the jerk at the origin, from which the model takes over within seconds
       (`cfx.models.composed`);
     - `policy`: observes all history up to each origin (`history` bounds it) and drives on from
@@ -92,9 +92,9 @@ class Forecast(FoldsOrFinished):
 
     With `samples` there are also paths that are sampled from each origin (scores of them:
     `cfx_forecasts.distributions`): of a stochastic policy (`learner.head=stochastic`), and
-    `population_ar`, `fixed_ar`, constant parameters with AR(1) noise on the acceleration, measured
-    on drivers of the other folds (with `run`, on all test drivers) or on the driver's own history,
-    before the first origin.
+    `pooled_ar`, `driver_specific_ar`, constant parameters with AR(1) noise on the acceleration,
+    measured on drivers of the other folds (with `run`, on all test drivers) or on the driver's own
+    history, before the first origin.
 
     Errors of speed and position at each horizon are the RMSE over the origins of a driver, then the
     mean over drivers, with an interval over drivers: origins of one driver overlap and are
@@ -221,11 +221,11 @@ class Forecast(FoldsOrFinished):
         context = test.context
         first = torch.full_like(test.first, round(seconds / test.batch.dt))
         first = torch.minimum(first, test.batch.lengths - 2)
-        fixed = context.calibrator.fixed(test.pairs, test.batch, first.cpu())
+        own = context.calibrator.driver_specific(test.pairs, test.batch, first.cpu())
         base = test.base
         if base is not None:
-            base = base_of(test.policy, fixed)
-        return replace(test, first=first, fixed=fixed, base=base)
+            base = base_of(test.policy, own)
+        return replace(test, first=first, driver_specific=own, base=base)
 
     def _paths(
         self, test: HeldOut, origins: forecasts.Origins, steps: int
@@ -240,10 +240,10 @@ class Forecast(FoldsOrFinished):
         agents = {}
         for name, agent in test.methods_without_history().items():
             agents[name] = (agent, test.network)
-        agents["fixed"] = (context.constant(FixedPolicy(), test.fixed), each)
-        residual = {"fixed_residual": (test.fixed, each)}
-        if test.population is not None:
-            residual["population_residual"] = (test.population, test.network)
+        agents["driver_specific"] = (context.constant(FixedPolicy(), test.driver_specific), each)
+        residual = {"driver_specific_residual": (test.driver_specific, each)}
+        if test.pooled is not None:
+            residual["pooled_residual"] = (test.pooled, test.network)
         for name, (parameters, network) in residual.items():
             agent = context.constant(FixedPolicy(residual=True), parameters)
             if can_drive(context.stepper, agent):
@@ -260,7 +260,7 @@ class Forecast(FoldsOrFinished):
         context, each = test.context, torch.arange(len(test.batch), device=origins.pair.device)
         agents = {}
         for name, parameters in _constants(test).items():
-            noise = residual_noise(test, parameters, own=name == "fixed")
+            noise = residual_noise(test, parameters, own=name == "driver_specific")
             agent = constant_with_noise(context, parameters, *noise)
             if can_drive(context.stepper, agent):
                 agents[f"{name}_ar"] = (agent, each)
@@ -304,7 +304,7 @@ def _constants(test: HeldOut) -> dict[str, Tensor]:
     """Returns constant parameters of each test driver, `(P, n)`, that a residual can go with."""
     if test.context.stepper.model.needs_simulator:
         return {}
-    found = {"fixed": test.fixed}
-    if test.population is not None:
-        found["population"] = test.population[test.network]
+    found = {"driver_specific": test.driver_specific}
+    if test.pooled is not None:
+        found["pooled"] = test.pooled[test.network]
     return found

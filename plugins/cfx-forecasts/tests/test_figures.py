@@ -56,7 +56,11 @@ def test_distributions_have_lines_and_histograms() -> None:
     table = make_distributions(forecasts)
     crps, coverage, pit = draw_distributions(table, forecasts).axes
     summary = summarize_distributions(table)
-    shown = {"population_ar": "population_ar", "fixed_ar": "fixed_ar", "policy": "policy_sampled"}
+    shown = {
+        "pooled_ar": "pooled_ar",
+        "driver_specific_ar": "driver_specific_ar",
+        "policy": "policy_sampled",
+    }
     for axes, column in ((crps, "crps_speed"), (coverage, "coverage")):
         lines = drawn_lines(axes)
         for method, name in shown.items():

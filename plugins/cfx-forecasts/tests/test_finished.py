@@ -35,7 +35,7 @@ FORECAST = [
 @pytest.fixture(scope="module")
 def drawn(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A job with a stochastic policy that knows nothing of its drivers."""
-    nothing = ["protocol.base=population", "protocol.history=0", "learner.cold_start_fraction=1"]
+    nothing = ["protocol.base=pooled", "protocol.history=0", "learner.cold_start_fraction=1"]
     head = ["learner.head=stochastic", "learner.paths=2"]
     return trained(tmp_path_factory.mktemp("jobs") / "drawn", *ROLLOUT, *nothing, *head)
 
@@ -83,7 +83,7 @@ def test_the_finished_policy_forecasts_from_every_moment(drawn: Path, tmp_path: 
         rows["speed_error"], (paths.speed[:, 20] - happened).numpy(), atol=1e-9
     )
     scored = pd.read_parquet(result.folder / "distributions.parquet")
-    assert {"policy", "population_ar", "fixed_ar"} <= set(scored["method"])
+    assert {"policy", "pooled_ar", "driver_specific_ar"} <= set(scored["method"])
 
 
 def test_who_was_learned_from_is_refused_and_who_is_too_short_is_left_out(

@@ -39,7 +39,13 @@ def test_all_methods_are_forecast_from_the_same_origins(result: cfx.plugin.Resul
     table = pd.read_parquet(result.folder / "forecasts.parquet")
     methods = set(table["method"])
     assert methods <= set(FORECAST_METHODS)
-    assert {"constant_speed", "constant_acceleration", "population", "fixed", "policy"} <= methods
+    assert {
+        "constant_speed",
+        "constant_acceleration",
+        "pooled",
+        "driver_specific",
+        "policy",
+    } <= methods
     counts = table.value_counts(["method", "pair_id", "horizon_s"]).reset_index()
     per_forecast = counts.groupby(["pair_id", "horizon_s"])["count"]
     assert per_forecast.min().equals(per_forecast.max())
@@ -53,12 +59,12 @@ def test_forecasts_stand_in_every_table(result: cfx.plugin.Result) -> None:
     long = pd.read_parquet(result.folder / "pair_metrics.parquet")
     own = long[(long["scope"] == "forecast") & (long["metric"] == "rmse_speed_2s")]
     means = own.groupby("method")["value"].mean()
-    for method in ("constant_speed", "fixed", "population"):
+    for method in ("constant_speed", "driver_specific", "pooled"):
         # Each driver has one pair here, so the mean over pairs is that over drivers.
         key = f"forecast/rmse_speed_2s/{method}"
         assert result.metrics[key] == pytest.approx(means[method])
-    wide = result.pairs[result.pairs["method"] == "fixed"].set_index("pair_id")
-    rows = own[own["method"] == "fixed"].set_index("pair_id")["value"]
+    wide = result.pairs[result.pairs["method"] == "driver_specific"].set_index("pair_id")
+    rows = own[own["method"] == "driver_specific"].set_index("pair_id")["value"]
     pd.testing.assert_series_equal(
         wide["forecast_rmse_speed_2s"], rows, check_names=False, rtol=1e-9
     )
@@ -66,14 +72,14 @@ def test_forecasts_stand_in_every_table(result: cfx.plugin.Result) -> None:
     console.print(*ForecastErrors().console(result.evaluation, result.metrics))
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
-    assert f"{result.metrics['forecast/rmse_speed_0.5s/fixed']:.3f}" in shown
+    assert f"{result.metrics['forecast/rmse_speed_0.5s/driver_specific']:.3f}" in shown
     assert "constant_acceleration" in shown
 
 
 def test_pooled_parameters_as_policy_forecast_the_same(result: cfx.plugin.Result) -> None:
     for error in ("rmse_speed_0.5s", "fde_2s"):
         policy = result.metrics[f"forecast/{error}/policy"]
-        assert policy == result.metrics[f"forecast/{error}/population"]
+        assert policy == result.metrics[f"forecast/{error}/pooled"]
 
 
 def test_driver_specific_parameters_read_nothing_after_the_first_origin(
@@ -86,10 +92,10 @@ def test_driver_specific_parameters_read_nothing_after_the_first_origin(
     later = pd.read_parquet(split.folder / "forecasts.parquet")
     both = ["method", "pair_id", "history_s", "horizon_s"]
     merged = table.merge(later, on=both, suffixes=("", "_split"))
-    other = merged[merged["method"] == "fixed"]
+    other = merged[merged["method"] == "driver_specific"]
     assert len(other)
     assert not other["speed_error"].equals(other["speed_error_split"])
-    same = merged[merged["method"] == "population"]
+    same = merged[merged["method"] == "pooled"]
     pd.testing.assert_series_equal(
         same["speed_error"], same["speed_error_split"], check_names=False
     )
@@ -135,7 +141,7 @@ def test_sampled_paths_are_scored_as_distributions(
     result = cfx.run([*FORECAST, "policy=gru", "protocol.samples=6", *learner, *small])
     table = pd.read_parquet(result.folder / "distributions.parquet")
     single = pd.read_parquet(result.folder / "forecasts.parquet")
-    sampled = {"policy", "population_ar", "fixed_ar"}
+    sampled = {"policy", "pooled_ar", "driver_specific_ar"}
     assert sampled | set(single["method"]) == set(table["method"])
     covered = table.groupby("method")["coverage"].mean()
     assert covered[list(sampled)].between(0, 1).all()
@@ -143,7 +149,7 @@ def test_sampled_paths_are_scored_as_distributions(
     key = ["pair_id", "method", "horizon_s"]
     errors = single.assign(error=single["speed_error"].abs()).groupby(key)["error"].mean()
     scores = table.groupby(key)["crps_speed"].mean()
-    for method in ("fixed", "fixed_residual", "constant_speed"):
+    for method in ("driver_specific", "driver_specific_residual", "constant_speed"):
         both = errors.xs(method, level="method"), scores.xs(method, level="method")
         pd.testing.assert_series_equal(*both, check_names=False, atol=1e-9)
     name = "distribution/crps_speed_0.5s/policy"

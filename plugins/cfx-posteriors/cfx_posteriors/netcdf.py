@@ -94,7 +94,7 @@ def inference_data(tables: Mapping[str, pd.DataFrame], model: DrivingModel) -> x
     for kind in ("prior", "population"):
         if kind in tables:
             groups[kind] = _dataset(tables[kind], names, model, None)
-    rows = tables["fits"].query("method == 'fixed'").set_index("pair_id").loc[pairs]
+    rows = tables["fits"].query("method == 'driver_specific'").set_index("pair_id").loc[pairs]
     diagnostics = {}
     for name, meaning in _DIAGNOSTICS.items():
         if name not in rows:

@@ -30,7 +30,10 @@ def test_intervals_stand_beside_the_same_point_estimates(
     printed = capsys.readouterr().out
     assert "What the recordings say of parameters" in printed
     fits = pd.read_parquet("known/fits.parquet")
-    rows, others = fits[fits["method"] == "fixed"], fits[fits["method"] != "fixed"]
+    rows, others = (
+        fits[fits["method"] == "driver_specific"],
+        fits[fits["method"] != "driver_specific"],
+    )
     assert len(rows) == 3
     for name in known.evaluation.names:
         assert (rows[f"low_{name}"] < rows[f"median_{name}"]).all()
@@ -65,7 +68,7 @@ def test_a_population_as_the_prior_leaves_less_doubt() -> None:
     for kind in ("laplace", "hierarchical"):
         cfx.run([*QUICK, f"hydra.run.dir={kind}", f"calibration.posterior={kind}"])
         fits = pd.read_parquet(f"{kind}/fits.parquet")
-        rows = fits[fits["method"] == "fixed"]
+        rows = fits[fits["method"] == "driver_specific"]
         width = [rows[f"high_{name}"] - rows[f"low_{name}"] for name in Krauss().space.names]
         doubt[kind] = pd.concat(width, axis=1).mean()
     assert (doubt["hierarchical"] < doubt["laplace"]).all()

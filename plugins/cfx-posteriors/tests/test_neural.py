@@ -74,7 +74,12 @@ def test_recordings_do_not_depend_on_how_many_are_simulated_at_once() -> None:
 
 
 def test_a_network_that_has_learned_too_little_is_named() -> None:
-    fits = {"pair_id": ["a", "b"], "method": "fixed", "noise_scale": 0.1, "noise_left": 0.0}
+    fits = {
+        "pair_id": ["a", "b"],
+        "method": "driver_specific",
+        "noise_scale": 0.1,
+        "noise_left": 0.0,
+    }
     own = {"pareto_k": [0.3, 0.8], "effective_samples": 500.0, "expected_coverage": 0.7}
     known = KnownParameters(pd.DataFrame({**fits, **own}), ())
     assert known.metrics()["posterior/expected_coverage"] == 0.7
@@ -102,6 +107,6 @@ def test_sumo_in_the_loop(way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for simulator in ("sumo", "memory"):
         cfx.run([*asked, f"simulator={simulator}", f"hydra.run.dir={simulator}"])
         fits = pd.read_parquet(f"{simulator}/fits.parquet")
-        found[simulator] = fits[fits["method"] == "fixed"].set_index("pair_id")
+        found[simulator] = fits[fits["method"] == "driver_specific"].set_index("pair_id")
     medians = [f"median_{name}" for name in ("tau", "accel", "decel", "minGap")]
     pd.testing.assert_frame_equal(found["sumo"][medians], found["memory"][medians], rtol=0.1)

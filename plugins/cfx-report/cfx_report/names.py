@@ -203,7 +203,7 @@ def methods_of(rows: Sequence[Row]) -> list[str]:
     found.pop("policy", None)
     if any_adapts(rows):
         return [*found, "policy"]
-    return [method for method in found if method != "fixed"] + ["fixed"]
+    return [method for method in found if method != "driver_specific"] + ["driver_specific"]
 
 
 def any_adapts(rows: Sequence[Row]) -> bool:
@@ -221,4 +221,4 @@ def baselines_of(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         jobs += row.jobs
     found = any_baselines(jobs)
-    return [baseline for baseline in found if baseline in {"fixed", "population"}]
+    return [baseline for baseline in found if baseline in {"driver_specific", "pooled"}]

@@ -153,7 +153,7 @@ def summary(jobs: Sequence[Result]) -> list[str]:
     """Returns sentences: against driver-specific calibration, and against pooled calibration."""
     first = (
         f"{_amount(jobs)}: is a policy that adapts the parameters closer to the real driver than"
-        f" {wording.explained('fixed')}?"
+        f" {wording.explained('driver_specific')}?"
     )
     compared = of_purpose(jobs, Purpose.ADAPTATION)
     warnings = _few(compared)
@@ -184,8 +184,8 @@ def _counts(jobs: Sequence[Result]) -> str:
     """Returns in how many jobs the policy is closer, over each of two baselines."""
     said = []
     for baseline, against in (
-        ("fixed", f"Of {len(jobs)} jobs"),
-        ("population", "against pooled calibration"),
+        ("driver_specific", f"Of {len(jobs)} jobs"),
+        ("pooled", "against pooled calibration"),
     ):
         sides = []
         for job in jobs:
@@ -208,7 +208,7 @@ def _best(jobs: Sequence[Result]) -> str:
     best = max(rows, key=_mean_for_ranking)
     if len(best.jobs) == 1:
         return f"The best: {_verdict(best.jobs[0])}"
-    gains = best.improvements("geometric", "fixed")
+    gains = best.improvements("geometric", "driver_specific")
     least, most = (wording.percent(float(end), 1) for end in (np.nanmin(gains), np.nanmax(gains)))
     return (
         f"The best mean over seeds: {best.name}. Improvement of the RMSE of speed:"
@@ -218,7 +218,7 @@ def _best(jobs: Sequence[Result]) -> str:
 
 
 def _mean_for_ranking(row: Row) -> float:
-    means = row.improvements("geometric", "fixed")
+    means = row.improvements("geometric", "driver_specific")
     known = means[np.isfinite(means)]
     return float(known.mean()) if len(known) else -np.inf
 
@@ -258,19 +258,19 @@ def _amount(jobs: Sequence[Result]) -> str:
     return f"{wording.plural(len(pairs), 'pair')} of leader and follower{where}"
 
 
-def _side(job: Result, baseline: str = "fixed") -> str:
+def _side(job: Result, baseline: str = "driver_specific") -> str:
     if job.statistics(baseline).ci95_low > 0:
         return "yes"
     return "no" if job.statistics(baseline).ci95_high < 0 else "undecided"
 
 
 def _verdict(job: Result) -> str:
-    if not np.isfinite(job.statistics("fixed").geometric):
+    if not np.isfinite(job.statistics("driver_specific").geometric):
         return f"{job.name}: no pair has a defined improvement."
     pooled = ""
-    if "population" in job.baselines():
-        pooled = f"; over pooled calibration {_gain(job, 'population')}"
-    gain = _gain(job, "fixed")
+    if "pooled" in job.baselines():
+        pooled = f"; over pooled calibration {_gain(job, 'pooled')}"
+    gain = _gain(job, "driver_specific")
     return f"{job.name}: {_side(job)}. Improvement of the RMSE of speed: {gain}{pooled}."
 
 

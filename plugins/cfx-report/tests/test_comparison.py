@@ -60,10 +60,12 @@ def test_errors_of_all_jobs_stand_in_one_table_in_metres(sweep: Path) -> None:
         assert row["policy"] == expected
         if job.purpose is Purpose.ADAPTATION:
             assert row["driver-specific"] == [
-                f"{job.metrics['rmse_speed/fixed']:.3f} {job.metrics['rmse_gap/fixed']:.2f}"
+                f"{job.metrics['rmse_speed/driver_specific']:.3f} {job.metrics['rmse_gap/driver_specific']:.2f}"
             ]
             assert row["over driver-specific"][0].startswith(
-                f"{100 * job.metrics['rmse_improvement/geometric']:+.1f} %".replace("-", "\u2212")
+                f"{100 * job.metrics['improvement/rmse_speed/driver_specific/geometric']:+.1f} %".replace(
+                    "-", "\u2212"
+                )
             )
     assert sum(span for _, span in sheet.groups) == len(sheet.columns)
 

@@ -53,7 +53,7 @@ def rows_of(sheet: Sheet, first: str) -> list[dict[str, str]]:
 def test_a_metric_of_a_plugin_that_is_not_here_stands_in_the_report(tmp_path: Path) -> None:
     for name in ("a", "b"):
         write_job(tmp_path / name, model=name, pairs=4)
-    add_metric(tmp_path / "a", {"comfort/policy": 1.25, "comfort/fixed": 1.0})
+    add_metric(tmp_path / "a", {"comfort/policy": 1.25, "comfort/driver_specific": 1.0})
     runs = read_runs([str(tmp_path)])
     with_it, without = runs.jobs
     (row,) = rows_of(all_metrics(with_it), "Comfort (m/s²)")
@@ -77,7 +77,7 @@ def test_a_metric_that_metrics_json_lacks_is_summarised_from_its_pairs(tmp_path:
         {
             "pair_id": ["a", "b", "a"],
             "driver": "d",
-            "method": ["policy", "policy", "fixed"],
+            "method": ["policy", "policy", "driver_specific"],
             "scope": "test",
             "metric": "comfort",
             "value": [0.5, 0.75, float("nan")],
@@ -87,7 +87,7 @@ def test_a_metric_that_metrics_json_lacks_is_summarised_from_its_pairs(tmp_path:
     (job,) = read_runs([str(tmp_path)]).jobs
     assert job.metric("comfort", "policy") == 0.75
     assert job.metric("comfort", "default") == 2.0
-    assert pd.isna(job.metric("comfort", "fixed"))
+    assert pd.isna(job.metric("comfort", "driver_specific"))
     assert pd.isna(job.metric("comfort", "policy", "steady"))
 
 
@@ -96,7 +96,7 @@ def test_the_error_to_expect_stands_beside_the_errors(tmp_path: Path) -> None:
     (job,) = read_runs([str(tmp_path / "a")]).jobs
     heading = "Expected of 90 % of drivers (m/s)"
     assert heading not in [column.heading for column in errors([job]).columns]
-    add_metric(tmp_path / "a", {"past/bound/policy": 1.357, "past/bound/fixed": 1.592})
+    add_metric(tmp_path / "a", {"past/bound/policy": 1.357, "past/bound/driver_specific": 1.592})
     (job,) = read_runs([str(tmp_path / "a")]).jobs
     found = {row["Method"]: row[heading] for row in rows_of(errors([job]), job.name)}
     assert (found["policy"], found["driver-specific"]) == ("1.357", "1.592")

@@ -123,8 +123,8 @@ def test_the_tables_hold_the_numbers_of_metrics_json(clusters: Clusters) -> None
     for name, values in metrics.items():
         for method, shown in (
             ("default", "default"),
-            ("population", "pooled"),
-            ("fixed", "driver-specific"),
+            ("pooled", "pooled"),
+            ("driver_specific", "driver-specific"),
             ("policy", "policy"),
         ):
             (row,) = (row for row in errors if row[:2] == [name, shown])
@@ -135,11 +135,11 @@ def test_the_tables_hold_the_numbers_of_metrics_json(clusters: Clusters) -> None
             whole = values.get(f"full_trajectory/rmse_speed/{method}")
             assert row[6] == ("" if whole is None else repr(whole))
         for prefix, shown, frames in (
-            ("rmse_improvement", "driver-specific", "test part"),
-            ("rmse_improvement/default", "default", "test part"),
-            ("rmse_improvement/population", "pooled", "test part"),
-            ("full_trajectory/rmse_improvement/default", "default", "full trajectory"),
-            ("full_trajectory/rmse_improvement/population", "pooled", "full trajectory"),
+            ("improvement/rmse_speed/driver_specific", "driver-specific", "test part"),
+            ("improvement/rmse_speed/default", "default", "test part"),
+            ("improvement/rmse_speed/pooled", "pooled", "test part"),
+            ("full_trajectory/improvement/rmse_speed/default", "default", "full trajectory"),
+            ("full_trajectory/improvement/rmse_speed/pooled", "pooled", "full trajectory"),
         ):
             (row,) = (
                 row
@@ -185,7 +185,7 @@ def test_few_very_bad_pairs_do_not_shrink_the_others(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=12)
     table = pd.read_csv(tmp_path / "job" / "pairs.csv")
     worst = table.index[table["method"] == "policy"][3]
-    table.loc[worst, "improvement"] = -40.0
+    table.loc[worst, "improvement_over_driver_specific"] = -40.0
     table.to_csv(tmp_path / "job" / "pairs.csv", index=False)
     runs = read_runs([str(tmp_path)])
     view = per_driver(runs.jobs)["against driver-specific calibration"]
@@ -205,7 +205,7 @@ def test_every_pair_stands_in_a_table_that_sorts(tmp_path: Path) -> None:
         table = job.by_pair.set_index("pair_id")
         for row in sheet.rows:
             pair = table.loc[row[0].text]
-            assert float(row[4].sort) == pair["improvement/fixed"]
+            assert float(row[4].sort) == pair["improvement/driver_specific"]
             assert float(row[headings.index("policy")].sort) == pair["rmse_speed/policy"]
 
 
@@ -224,7 +224,9 @@ def test_clusters_come_from_one_job_or_from_a_job_each(tmp_path: Path) -> None:
 def test_best_median_and_worst_drives_alone_are_shown(tmp_path: Path) -> None:
     write_job(tmp_path / "job", pairs=9)
     (job,) = read_runs([str(tmp_path)]).jobs
-    gain = job.by_pair.set_index("pair_id")["improvement/fixed"].sort_values(ascending=False)
+    gain = job.by_pair.set_index("pair_id")["improvement/driver_specific"].sort_values(
+        ascending=False
+    )
     chosen = chosen_pairs(job)
     assert [(one.rank, one.pair_id) for one in chosen] == [
         ("best", gain.index[0]),
@@ -267,10 +269,12 @@ def test_what_is_gained_after_the_start_has_a_view_of_its_own(tmp_path: Path) ->
     ]
     assert not any("5 s" in name for view in views for name in view)  # test parts may be no longer
     steady = {
-        f"steady/rmse_improvement/fixed/{name}": 0.1
+        f"steady/improvement/rmse_speed/driver_specific/{name}": 0.1
         for name in ("geometric", "ci95_low", "ci95_high", "ratio_of_means", "median")
     }
-    errors = {f"steady/rmse_speed/{method}": 0.5 for method in ("default", "fixed", "policy")}
+    errors = {
+        f"steady/rmse_speed/{method}": 0.5 for method in ("default", "driver_specific", "policy")
+    }
     (tmp_path / "a" / "metrics.json").write_text(json.dumps(metrics | steady | errors))
     jobs = read_runs([tmp_path / "a"]).jobs
     assert "against driver-specific calibration, test part after the first 5 s" in overview(jobs)
@@ -316,9 +320,9 @@ def test_the_summary_answers_by_the_interval(tmp_path: Path) -> None:
     metrics = json.loads(path.read_text(encoding="utf-8"))
     for low, high, answer in ((0.1, 0.3, "yes"), (-0.3, -0.1, "no"), (-0.1, 0.1, "undecided")):
         changed = {
-            "rmse_improvement/geometric": 0.123,
-            "rmse_improvement/ci95_low": low,
-            "rmse_improvement/ci95_high": high,
+            "improvement/rmse_speed/driver_specific/geometric": 0.123,
+            "improvement/rmse_speed/driver_specific/ci95_low": low,
+            "improvement/rmse_speed/driver_specific/ci95_high": high,
         }
         path.write_text(json.dumps(metrics | changed), encoding="utf-8")
         question, said, warning = summary(read_runs([str(tmp_path)]).jobs)
@@ -345,7 +349,7 @@ def test_a_calibration_is_none_of_the_policies_that_adapt(tmp_path: Path) -> Non
         assert said_of_policies not in page.words
     assert "policy" not in alone[0].shown_methods, "a constant set is shown once"
     (moves,) = [job for job in runs.jobs if job.purpose is Purpose.ADAPTATION]
-    sheet = improvements.clusters(cluster_series([moves]), "fixed")
+    sheet = improvements.clusters(cluster_series([moves]), "driver_specific")
     found = improvements.ClustersSection().context(runs)
     assert found is not None
     assert found["sheets"]["driver-specific calibration"].rows == sheet.rows
@@ -358,7 +362,7 @@ def test_calibrated_parameters_have_their_bounds_and_shares(tmp_path: Path) -> N
     table = pd.read_csv(tmp_path / "job" / "pairs.csv")
     axes = json.loads((tmp_path / "job" / "data.json").read_text())["parameters"]
     first = axes[0]
-    fixed = table["method"] == "fixed"
+    fixed = table["method"] == "driver_specific"
     values = np.linspace(first["low"], first["high"], fixed.sum())
     table.loc[fixed, f"parameter_{first['name']}"] = values
     table.to_csv(tmp_path / "job" / "pairs.csv", index=False)
@@ -395,7 +399,7 @@ def test_the_papers_figures_stand_beside_those_of_its_experiments(
     assert "the search (here random; there Bayesian optimization)" in said
     _, metrics, page = clusters
     low, high = (
-        metrics[f"w99 · {c}"]["rmse_improvement/population/mean_ratio"] or 0.0
+        metrics[f"w99 · {c}"]["improvement/rmse_speed/pooled/mean_ratio"] or 0.0
         for c in ("conservative", "aggressive")
     )
     does = "fares better" if high > low else "fares no better"

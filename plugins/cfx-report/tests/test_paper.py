@@ -49,18 +49,26 @@ def test_a_row_of_seeds_has_their_mean_and_spread(sweep: Path) -> None:
         for seed in SEEDS:
             metrics = json.loads((sweep / f"{model}-{seed}" / "metrics.json").read_text())
             values.append(metrics["rmse_speed/policy"])
-            gains.append(metrics["rmse_improvement/geometric"])
+            gains.append(metrics["improvement/rmse_speed/driver_specific/geometric"])
         assert row["rmse_speed_mps/policy"] == pytest.approx(np.mean(values))
         assert row["rmse_speed_mps/policy/sd"] == pytest.approx(np.std(values, ddof=1))
-        assert row["improvement/fixed"] == pytest.approx(np.mean(gains))
+        assert row["improvement/driver_specific"] == pytest.approx(np.mean(gains))
 
 
 def test_each_job_has_a_row_with_its_interval(sweep: Path) -> None:
     table = pd.read_csv(io.StringIO(written(sweep, "--tables", "csv")))
     assert len(table) == 6
     assert "krauss · seed 1" in set(table["row"])
-    low, high = table["improvement/fixed/ci95_low"], table["improvement/fixed/ci95_high"]
-    assert bool(((low <= table["improvement/fixed"]) & (table["improvement/fixed"] <= high)).all())
+    low, high = (
+        table["improvement/driver_specific/ci95_low"],
+        table["improvement/driver_specific/ci95_high"],
+    )
+    assert bool(
+        (
+            (low <= table["improvement/driver_specific"])
+            & (table["improvement/driver_specific"] <= high)
+        ).all()
+    )
 
 
 def test_the_order_of_rows_is_that_of_the_jobs(sweep: Path) -> None:
@@ -109,7 +117,7 @@ def test_a_calibration_has_its_parameters_in_a_table_and_no_policy(tmp_path: Pat
     assert text[text.index("\\begin") :].isascii(), "pdfLaTeX knows no other letters by itself"
     table = pd.read_csv(io.StringIO(written(folder, "--tables", "csv")))
     assert "rmse_speed_mps/policy" not in table
-    assert "rmse_speed_mps/fixed" in table
+    assert "rmse_speed_mps/driver_specific" in table
 
 
 @pytest.mark.parametrize(

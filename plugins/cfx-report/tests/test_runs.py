@@ -97,8 +97,8 @@ def test_what_a_job_says_of_itself(tmp_path: Path) -> None:
     )
     (job,) = read_runs([str(tmp_path / "job")]).jobs
     assert job.methods == ACROSS
-    assert job.baselines() == ("fixed", "default", "population")
-    assert job.baselines("full_trajectory") == ("default", "population")
+    assert job.baselines() == ("driver_specific", "default", "pooled")
+    assert job.baselines("full_trajectory") == ("default", "pooled")
     assert (job.setting("preset") or "", job.overrides, job.seconds) == (
         "paper/clusters",
         ("model=krauss",),

@@ -38,7 +38,7 @@ def test_a_row_has_the_mean_over_seeds_and_their_range(runs: Runs) -> None:
     ]
     sheet = over_seeds(rows)
     headings = [column.heading for column in sheet.columns]
-    gains = rows[1].improvements("geometric", "fixed")
+    gains = rows[1].improvements("geometric", "driver_specific")
     assert len(gains) == len(SEEDS)
     cell = sheet.rows[1][headings.index("over driver-specific")]
     assert float(cell.sort) == pytest.approx(np.mean(gains))

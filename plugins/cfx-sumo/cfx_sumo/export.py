@@ -51,11 +51,12 @@ class VTypeExport(ExportFormat):
 def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     """Writes a vTypeDistribution for each cluster, with a vType for each pair's parameters.
 
-    The parameters are those of the method `fixed`: calibrated to the driver, constant. The
-    distribution `drivers` holds them all. Each vType is one driver's whole set, so that a vehicle
-    drawn from it has parameters that belong together, as correlated as they are among drivers.
-    Where the job has found a population (`calibration.posterior=hierarchical`), the distribution
-    `population` holds new drivers of it: what a recording leaves open does not widen it.
+    The parameters are those of the method `driver_specific`: calibrated to the driver, constant.
+    The distribution `drivers` holds them all. Each vType is one driver's whole set, so that a
+    vehicle drawn from it has parameters that belong together, as correlated as they are among
+    drivers. Where the job has found a population (`calibration.posterior=hierarchical`), the
+    distribution `population` holds new drivers of it: what a recording leaves open does not widen
+    it.
 
     Args:
         run: a job's output folder, or the id of its MLflow run.
@@ -176,14 +177,14 @@ def _folder(run: str | Path) -> tuple[Path, Path]:
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Reads the model's node, and the rows of `fixed`, calmest cluster first."""
+    """Reads the model's node, and the rows of `driver_specific`, calmest cluster first."""
     job_folder.examine(folder)
     try:
         node = job_folder.parse_yaml((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
         if not isinstance(node, dict):
             raise ValueError("config.yaml: model is no mapping")
         table = pd.read_csv(folder / "pairs.csv", dtype={"pair_id": str})
-        fixed = table[table["method"] == "fixed"]
+        fixed = table[table["method"] == "driver_specific"]
         values = fixed.filter(like="parameter_").to_numpy(dtype=float)
         fixed = fixed[np.isfinite(values).all(axis=1)]
         fixed = fixed.sort_values("style_score", kind="stable").reset_index(drop=True)
@@ -193,7 +194,7 @@ def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
         ) from error
     if fixed.empty:
         raise DataError(
-            f"{folder}/pairs.csv holds no driver-specific parameters (method `fixed`); give a job"
+            f"{folder}/pairs.csv holds no driver-specific parameters; give a job"
             " that calibrated some"
         )
     return node, fixed

@@ -78,7 +78,8 @@ def test_offsets_start_in_sumo_from_what_they_start_from_in_the_job(
     )
     rows = pd.read_csv(folder / "pairs.csv").set_index(["pair_id", "method"])
     base, fixed = (
-        float(rows.loc[(table["pair_id"], method), "rmse_speed"]) for method in ("shrunk", "fixed")
+        float(rows.loc[(table["pair_id"], method), "rmse_speed"])
+        for method in ("shrunk", "driver_specific")
     )
     assert base != pytest.approx(fixed, abs=1e-2)
 

@@ -702,14 +702,14 @@ def test_in_sumo_a_policy_drives_as_in_memory(
         "default": simulate_closed_loop(
             stepper, _baseline(policy, DefaultPolicy(), 4), Followers(batch, own), first
         ),
-        "fixed": simulate_closed_loop(
+        "driver_specific": simulate_closed_loop(
             stepper, _baseline(policy, FixedPolicy(), 4), Followers(batch, own), first
         ),
     }
     evaluation = evaluate(
         ComparedPairs(pairs, batch, first, style_of(pairs)), {"test": loops}, model.space
     )
-    knowledge = PolicyKnowledge("fixed", history)
+    knowledge = PolicyKnowledge("driver_specific", history)
     job = FinishedJob(pairs, policy, evaluation, tmp_path / "policy", knowledge)
     shown = simulate_in_sumo(job, read_motorway(None, tmp_path), 4)
     assert {one.pair.pair_id: one.first for one in shown} == {

@@ -49,8 +49,8 @@ def job(folder: Path, node: dict[str, Any], shift: float = 0.1) -> Path:
     low, high = (bound.tolist() for bound in model.space.bounds())
     rows = []
     for k, cluster in enumerate(CLUSTERS):
-        for method in ("default", "fixed", "policy"):
-            share = shift * (k + 1) if method == "fixed" else 0.9
+        for method in ("default", "driver_specific", "policy"):
+            share = shift * (k + 1) if method == "driver_specific" else 0.9
             values = {
                 f"parameter_{n}": a + share * (b - a)
                 for n, a, b in zip(model.space.names, low, high, strict=True)
@@ -89,7 +89,7 @@ def test_each_cluster_is_a_distribution_of_its_drivers_own_fixed_parameters(tmp_
     }
     table = (
         pd.read_csv(folder / "pairs.csv")
-        .query("method == 'fixed'")
+        .query("method == 'driver_specific'")
         .sort_values("style_score")
         .reset_index()
     )
@@ -123,7 +123,9 @@ def test_krauss_loses_its_brake_build_up_time_and_says_so(tmp_path: Path) -> Non
         line.startswith("Note: SUMO's KraussOrig1 has no brake build-up time t_i; tau is t_r")
         for line in lines
     )
-    fixed = pd.read_csv(folder / "pairs.csv").query("method == 'fixed' and cluster == 'aggressive'")
+    fixed = pd.read_csv(folder / "pairs.csv").query(
+        "method == 'driver_specific' and cluster == 'aggressive'"
+    )
     (kind,) = types(tmp_path / "here.add.xml")["aggressive"].values()
     assert (kind["carFollowModel"], float(kind["tau"])) == (
         "KraussOrig1",
@@ -168,7 +170,7 @@ def test_sumo_loads_it_as_it_is_and_one_vehicle_of_each_type_drives(tmp_path: Pa
     ]
     for number, node in enumerate(nodes):
         folder = job(tmp_path / str(number), node)
-        own = pd.read_csv(folder / "pairs.csv").query("method == 'fixed'")
+        own = pd.read_csv(folder / "pairs.csv").query("method == 'driver_specific'")
         own.filter(regex="^parameter_").to_parquet(folder / "population.parquet")
         export(folder)
         found = types(folder / "drivers.add.xml")
@@ -301,7 +303,7 @@ def test_vtypes_have_in_plain_sumo_the_error_that_the_job_says(
     )
     assert done.returncode == 0, done.stderr
     speeds = json.loads(done.stdout.splitlines()[-1])
-    table = pd.read_csv(finished.folder / "pairs.csv").query("method == 'fixed'")
+    table = pd.read_csv(finished.folder / "pairs.csv").query("method == 'driver_specific'")
     said = table.set_index("pair_id")["rmse_speed"]
     assert len(said) == 3
     for name, error in said.items():

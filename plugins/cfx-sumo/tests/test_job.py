@@ -74,7 +74,7 @@ def test_any_model_of_sumo_is_calibrated_by_its_name(tmp_path: Path) -> None:
         "model.attributes={treaction: 0.6}",
         "simulator=sumo",
     )
-    fixed = result.pairs[result.pairs["method"] == "fixed"]
+    fixed = result.pairs[result.pairs["method"] == "driver_specific"]
     assert fixed["rmse_speed"].between(0.0, 5.0).all()
     assert fixed["parameter_tau"].between(0.5, 3.0).all()
 

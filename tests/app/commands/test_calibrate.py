@@ -47,7 +47,7 @@ def test_a_calibration_and_a_sweep_of_models_speak_of_no_policy(
     header = Path("sweep/summary.csv").read_text().partition("\n")[0]
     assert "policy" not in header
     assert "improvement" not in header
-    assert "rmse_gap_fixed" in header
+    assert "rmse_gap_driver_specific" in header
     assert len(list(Path("sweep").glob("*/fits.parquet"))) == 2
 
 
@@ -85,9 +85,9 @@ def test_whole_trajectories_are_calibrated_on_and_nothing_is_called_a_test(
     printed = capsys.readouterr().out
     assert "all of what was calibrated on" in printed
     assert "fitted" not in printed
-    fits = pd.read_parquet("job/fits.parquet").query("method == 'fixed'")
+    fits = pd.read_parquet("job/fits.parquet").query("method == 'driver_specific'")
     assert not [name for name in fits if name.startswith("test_")]
-    table = pd.read_csv("job/pairs.csv").query("method == 'fixed'")
+    table = pd.read_csv("job/pairs.csv").query("method == 'driver_specific'")
     assert set(table["frames"]) == {299}
     np.testing.assert_allclose(fits["train_rmse_speed"], table["rmse_speed"])
 

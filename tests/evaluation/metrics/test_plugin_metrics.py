@@ -62,14 +62,14 @@ def test_a_plugins_metric_stands_in_every_result(
     overrides = [one for one in QUICK if not one.startswith("tracking")]
     result = cfx.run([*overrides, f"tracking.uri={store}", "metrics=[own,mean_gap]"])
 
-    assert result.metrics["mean_gap/fixed"] > 0
+    assert result.metrics["mean_gap/driver_specific"] > 0
     assert result.metrics["mean_gap/real"] > 0
     written = json.loads((result.folder / "metrics.json").read_text())
-    assert written["mean_gap/fixed"] == result.metrics["mean_gap/fixed"]
+    assert written["mean_gap/driver_specific"] == result.metrics["mean_gap/driver_specific"]
 
     pairs = pd.read_csv(result.folder / "pairs.csv")
-    of_fixed = pairs.loc[pairs["method"] == "fixed"]
-    assert of_fixed["mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/fixed"])
+    of_fixed = pairs.loc[pairs["method"] == "driver_specific"]
+    assert of_fixed["mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/driver_specific"])
     assert of_fixed["real_mean_gap"].mean() == pytest.approx(result.metrics["mean_gap/real"])
     values = pd.read_parquet(result.folder / "pair_metrics.parquet")
     scopes = values.loc[values["metric"] == "mean_gap", "scope"]
@@ -83,7 +83,9 @@ def test_a_plugins_metric_stands_in_every_result(
     from mlflow import MlflowClient
 
     run = MlflowClient(store).get_run(result.run_id)
-    assert run.data.metrics["mean_gap/fixed"] == pytest.approx(written["mean_gap/fixed"])
+    assert run.data.metrics["mean_gap/driver_specific"] == pytest.approx(
+        written["mean_gap/driver_specific"]
+    )
     assert run.data.tags["cfx.plugin.mean-gap-metrics"] == "1.0"
 
     out = io.StringIO()
@@ -101,7 +103,7 @@ def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> No
         folder = tmp_path / name
         folder.mkdir()
         metrics = {
-            "rmse_improvement/geometric": 0.1,
+            "improvement/rmse_speed/driver_specific/geometric": 0.1,
             "mean_gap/policy": value,
             "theil_u/policy": 0.01,
         }
@@ -111,7 +113,9 @@ def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> No
     # A job may say nothing of its metrics.
     old = tmp_path / "old"
     old.mkdir()
-    (old / "metrics.json").write_text(json.dumps({"rmse_improvement/geometric": 0.2}))
+    (old / "metrics.json").write_text(
+        json.dumps({"improvement/rmse_speed/driver_specific/geometric": 0.2})
+    )
     (old / "data.json").write_text("{}")
     statuses[old] = JobStatus(0, "", "", ("model=old",))
 
@@ -159,11 +163,11 @@ def test_broken_metrics_are_left_out_told_and_counted(
     plugin(install, "mean_gap", GOOD)
     with caplog.at_level(logging.WARNING, logger="cfx"):
         result = cfx.run([*QUICK, "metrics=all"])
-    assert "mean_gap/fixed" in result.metrics
+    assert "mean_gap/driver_specific" in result.metrics
     said = json.loads((result.folder / "data.json").read_text())
     assert {one["name"] for one in said["metrics_left_out"]} == set(BROKEN)
     for name in BROKEN:
-        assert f"{name}/fixed" not in result.metrics
+        assert f"{name}/driver_specific" not in result.metrics
         distribution = f"{name.replace('_', '-')}-metrics"
         warned = [record for record in caplog.records if distribution in record.getMessage()]
         assert len(warned) == 1, name

@@ -198,7 +198,7 @@ def test_the_populations_parameters_fit_all_their_drivers() -> None:
     pairs = wavy_pairs(Krauss(), truth)
     ensemble_size = torch.tensor([[True] * 4 + [False], [False, False, False, False, True]])
     last = torch.full((5,), 250)
-    found = calibrator(samples=2048).population(pairs, PairBatch.of(pairs), last, ensemble_size)
+    found = calibrator(samples=2048).pooled(pairs, PairBatch.of(pairs), last, ensemble_size)
     assert found[:, 0].tolist() == pytest.approx([1.7, 4.0], abs=0.1)
 
 
@@ -220,12 +220,12 @@ def result(tmp_path_factory: pytest.TempPathFactory) -> cfx.plugin.Result:
 
 
 def test_all_methods_are_simulated_over_the_same_frames(result: cfx.plugin.Result) -> None:
-    methods = ["default", "population", "fixed", "policy"]
+    methods = ["default", "pooled", "driver_specific", "policy"]
     assert result.pairs.groupby("pair_id")["method"].apply(list).tolist() == [methods] * 6
     by_pair = result.pairs.groupby("pair_id")[["frames", "fold"]]
     assert by_pair.min().equals(by_pair.max())
     assert set(result.pairs["fold"]) == {0, 1, 2}
-    population = result.pairs[result.pairs.method == "population"]
+    population = result.pairs[result.pairs.method == "pooled"]
     by_fold = population.groupby("fold")["parameter_t_r"]
     assert by_fold.min().equals(by_fold.max()), "one set for all drivers of a fold"
     assert len(set(population["parameter_t_r"])) > 1
@@ -234,29 +234,29 @@ def test_all_methods_are_simulated_over_the_same_frames(result: cfx.plugin.Resul
 def test_every_baseline_has_its_improvement(result: cfx.plugin.Result) -> None:
     policy = result.pairs[result.pairs.method == "policy"].set_index("pair_id")
     for baseline, key in (
-        ("fixed", "rmse_improvement"),
-        ("population", "rmse_improvement/population"),
+        ("driver_specific", "improvement/rmse_speed/driver_specific"),
+        ("pooled", "improvement/rmse_speed/pooled"),
     ):
         before = result.pairs[result.pairs.method == baseline].set_index("pair_id")
         gain = (before.rmse_speed - policy.rmse_speed) / before.rmse_speed
         geometric = 1 - gmean(1 - gain)
         assert result.metrics[f"{key}/geometric"] == pytest.approx(geometric)
         assert result.metrics[f"{key}/mean_ratio"] == pytest.approx(gain.mean())
-        column = "improvement" if baseline == "fixed" else f"improvement_over_{baseline}"
+        column = f"improvement_over_{baseline}"
         assert policy[column].to_numpy() == pytest.approx(gain.to_numpy())
         whole = (
             before.full_trajectory_rmse_speed - policy.full_trajectory_rmse_speed
         ) / before.full_trajectory_rmse_speed
-        if baseline == "population":
+        if baseline == "pooled":
             assert result.metrics[
-                "full_trajectory/rmse_improvement/population/geometric"
+                "full_trajectory/improvement/rmse_speed/pooled/geometric"
             ] == pytest.approx(1 - gmean(1 - whole))
         else:
             assert whole.isna().all(), (
                 "driver-specific parameters have seen the first part of the trajectory"
             )
     assert result.metrics["full_trajectory/rmse_gap/default"] > 0
-    assert "full_trajectory/rmse_speed/fixed" not in result.metrics
+    assert "full_trajectory/rmse_speed/driver_specific" not in result.metrics
 
 
 def test_the_design_is_written_down(result: cfx.plugin.Result) -> None:
@@ -267,13 +267,13 @@ def test_the_design_is_written_down(result: cfx.plugin.Result) -> None:
 
 def test_trajectories_and_curves_are_kept(result: cfx.plugin.Result) -> None:
     drives = pd.read_parquet(result.folder / "trajectories.parquet")
-    row = result.pairs[(result.pairs.method == "population")].iloc[0]
+    row = result.pairs[(result.pairs.method == "pooled")].iloc[0]
     own = drives[drives.pair_id == row.pair_id].iloc[1:]
     assert len(own) == row.frames
-    assert math.sqrt(((own.speed_population - own.real_speed) ** 2).mean()) == pytest.approx(
+    assert math.sqrt(((own.speed_pooled - own.real_speed) ** 2).mean()) == pytest.approx(
         row.rmse_speed
     )
-    assert {"t_r_policy", "t_i_fixed", "gap_default", "leader_speed", "real_gap"} <= set(
+    assert {"t_r_policy", "t_i_driver_specific", "gap_default", "leader_speed", "real_gap"} <= set(
         own.columns
     )
     curves = pd.read_parquet(result.folder / "curves.parquet")
@@ -304,7 +304,7 @@ def test_what_a_test_driver_does_changes_nothing_that_is_learned_for_them() -> N
     assert all(torch.equal(one[key][fold], two[key][fold]) for key in one)
     others = [k for k in range(3) if k != fold]
     assert all(any(not torch.equal(one[key][k], two[key][k]) for key in one) for k in others)
-    same = (first.method == "population") & (first.fold == fold)
+    same = (first.method == "pooled") & (first.fold == fold)
     columns = ["fold", "parameter_t_r"]
     pd.testing.assert_frame_equal(first[same][columns], second[same][columns])
 
@@ -315,7 +315,7 @@ def test_a_baseline_as_policy_is_no_method_of_its_own(policy: Policy) -> None:
     found = AcrossDrivers(folds=2).run(context).evaluation
     found = replace(found, purpose=Purpose.of(Krauss(), policy)).distinct_methods()
     assert "rmse_speed/policy" not in found.metrics()
-    assert set(found.table["method"]) == {"default", "population", "fixed"}
+    assert set(found.table["method"]) == {"default", "pooled", "driver_specific"}
 
 
 def test_short_pairs_are_learned_from_but_not_tested() -> None:
@@ -365,11 +365,11 @@ def test_a_job_learns_by_rollout_and_measures_how_much_history_matters(
     learned: cfx.plugin.Result,
 ) -> None:
     history = pd.read_parquet(learned.folder / "history.parquet")
-    assert set(history["base"]) == {"own", "population"}
+    assert set(history["base"]) == {"driver_specific", "pooled"}
     assert list(dict.fromkeys(history["amount"])) == ["0 s", "5 s", "80 %"]
-    whole = history[(history["base"] == "own") & (history["amount"] == "80 %")].set_index(
-        "pair_id"
-    )["rmse_speed"]
+    whole = history[
+        (history["base"] == "driver_specific") & (history["amount"] == "80 %")
+    ].set_index("pair_id")["rmse_speed"]
     policy = learned.pairs[learned.pairs["method"] == "policy"].set_index("pair_id")["rmse_speed"]
     pd.testing.assert_series_equal(whole, policy, check_names=False, rtol=1e-9)
     again = cfx.load(learned.folder).policy
@@ -394,7 +394,9 @@ def test_less_history_is_what_the_plot_says(learned: cfx.plugin.Result, tmp_path
     none = ["protocol.history=0", "protocol.histories=[]"]
     other = rollout(tmp_path / "other", *none, "data.platoon_size=4")
     history = pd.read_parquet(learned.folder / "history.parquet")
-    without = history[(history["base"] == "own") & (history["amount"] == "0 s")]["rmse_speed"]
+    without = history[(history["base"] == "driver_specific") & (history["amount"] == "0 s")][
+        "rmse_speed"
+    ]
     policy = other.pairs[other.pairs["method"] == "policy"]["rmse_speed"].to_numpy()
     np.testing.assert_allclose(without, policy, rtol=1e-9)
     assert not np.allclose(learned.pairs[learned.pairs["method"] == "policy"]["rmse_speed"], policy)
@@ -403,10 +405,10 @@ def test_less_history_is_what_the_plot_says(learned: cfx.plugin.Result, tmp_path
 @pytest.mark.parametrize(
     ("base", "shrinkage", "method"),
     [
-        ("own", 0, "fixed"),
-        ("own", 0.7, "shrunk"),
-        ("own", 1, "default"),
-        ("population", 0.7, "population"),
+        ("driver_specific", 0, "driver_specific"),
+        ("driver_specific", 0.7, "shrunk"),
+        ("driver_specific", 1, "default"),
+        ("pooled", 0.7, "pooled"),
         ("default", 0.7, "default"),
     ],
 )
@@ -419,9 +421,9 @@ def test_without_learning_the_policy_is_its_base(base: str, shrinkage: float, me
     rmse = found.table.set_index(["method", "pair_id"])["rmse_speed"]
     np.testing.assert_allclose(rmse["policy"], rmse[method], rtol=1e-5)
     # What drawing does on its own is shown where it was done.
-    is_drawn = base == "own" and shrinkage > 0
+    is_drawn = base == "driver_specific" and shrinkage > 0
     assert ("shrunk" in rmse.index.get_level_values(0)) == is_drawn
-    assert ("rmse_improvement/shrunk/geometric" in found.metrics()) == is_drawn
+    assert ("improvement/rmse_speed/shrunk/geometric" in found.metrics()) == is_drawn
     assert "history" not in found.tables
 
 
@@ -437,11 +439,11 @@ def test_a_policy_reaches_farther_than_constant_parameters(tmp_path: Path) -> No
     result = rollout(
         tmp_path / "one",
         "model.adaptation_bounds={t_r: [0.05, 60]}",
-        "protocol.base=population",
+        "protocol.base=pooled",
         *still,
     )
     rmse = result.pairs.set_index(["method", "pair_id"])["rmse_speed"]
-    np.testing.assert_allclose(rmse["policy"], rmse["population"], rtol=1e-5)
+    np.testing.assert_allclose(rmse["policy"], rmse["pooled"], rtol=1e-5)
     for policy in (result.policy, cfx.load(tmp_path / "one").policy):
         largest = float(Krauss().space["t_r"].high)
         assert policy.space["t_r"].high == 60 > largest

@@ -96,15 +96,15 @@ def test_larger_errors_than_those_of_constants_are_warned_of() -> None:
 
 
 def test_bounds_know_nothing_of_the_driver_that_they_are_for() -> None:
-    columns = ["past_rmse_speed_policy", "past_rmse_speed_fixed"]
+    columns = ["past_rmse_speed_policy", "past_rmse_speed_driver_specific"]
     table = pd.DataFrame({name: np.ones(24) for name in columns})
     fold = np.repeat([0, 1], 12)
-    for method, growth in (("policy", 2.0), ("fixed", 3.0)):
+    for method, growth in (("policy", 2.0), ("driver_specific", 3.0)):
         table[f"rmse_speed_{method}"] = np.where(fold == 0, growth, 10.0 * growth)
     bounds = with_bounds_of_other_folds(table, fold)
     assert set(bounds["bound_policy"][fold == 0]) == {20.0}
     assert set(bounds["bound_policy"][fold == 1]) == {2.0}
-    assert set(bounds["bound_fixed"][fold == 1]) == {3.0}
+    assert set(bounds["bound_driver_specific"][fold == 1]) == {3.0}
 
 
 def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) -> None:
@@ -114,7 +114,7 @@ def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) ->
     assert len(past) == 16
     assert past["share"].between(0.0, 1.0).all()
     pairs = learned.pairs.set_index(["pair_id", "method"])["rmse_speed"]
-    for method in ("policy", "fixed"):
+    for method in ("policy", "driver_specific"):
         found = pairs.xs(method, level="method")[past["pair_id"]]
         np.testing.assert_allclose(found, past[f"rmse_speed_{method}"])
     metrics = json.loads((folder / "metrics.json").read_text())
@@ -127,7 +127,7 @@ def test_a_policy_that_combines_does_so_wherever_it_is_tested(tmp_path: Path) ->
     assert expected.policy == pytest.approx(growth.max())
     full = learned.pairs.groupby("method")["full_trajectory_rmse_speed"].max()
     assert expected.unseen == pytest.approx(full["policy"])
-    assert expected.unseen_constant == pytest.approx(full["population"])
+    assert expected.unseen_constant == pytest.approx(full["pooled"])
     other = tmp_path / "other"
     cfx.run(
         [
@@ -160,7 +160,9 @@ def test_drivers_are_unlike_those_learned_from_by_standard_deviations() -> None:
 
 def test_drivers_unlike_those_learned_from_are_counted() -> None:
     errors = {"share": 1.0, "rmse_speed_alone": 1.0, "past_rmse_speed_alone": 1.0}
-    errors |= {f"{part}_{method}": 1.0 for part in _PARTS for method in ("policy", "fixed")}
+    errors |= {
+        f"{part}_{method}": 1.0 for part in _PARTS for method in ("policy", "driver_specific")
+    }
     table = pd.DataFrame(errors, index=range(5)).assign(
         unlike=[0.5, 3.5, 4.0, 2.9, np.nan],
         unlike_in=["acceleration", "time_gap", "time_gap", "acceleration", ""],

@@ -59,7 +59,7 @@ def trained(folder: Path, *overrides: str) -> Path:
 @pytest.fixture(scope="module")
 def unseen(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A job whose policy knows nothing of its drivers."""
-    nothing = ["protocol.base=population", "protocol.history=0", "learner.cold_start_fraction=1"]
+    nothing = ["protocol.base=pooled", "protocol.history=0", "learner.cold_start_fraction=1"]
     return trained(tmp_path_factory.mktemp("jobs") / "unseen", *ROLLOUT, *nothing)
 
 
@@ -136,11 +136,11 @@ def test_it_drives_with_the_network_of_all_from_the_populations_parameters(
         torch.tensor(rows["full_trajectory_rmse_speed"].to_numpy()),
         error[:, 1:].square().mean(1).sqrt(),
     )
-    assert policy.population is not None
-    population = result.pairs[result.pairs.method == "population"][
+    assert policy.pooled is not None
+    population = result.pairs[result.pairs.method == "pooled"][
         ["parameter_t_r", "parameter_t_i"]
     ].to_numpy()
-    torch.testing.assert_close(torch.tensor(population), policy.population[number])
+    torch.testing.assert_close(torch.tensor(population), policy.pooled[number])
 
 
 def test_it_starts_from_drivers_own_parameters_where_it_learned_so(
@@ -148,7 +148,7 @@ def test_it_starts_from_drivers_own_parameters_where_it_learned_so(
 ) -> None:
     """They are those of the model alone, also where the policy has a residual."""
     metrics = transferred(known, tmp_path / "known").metrics
-    assert metrics["rmse_speed/shrunk"] != metrics["rmse_speed/fixed"]
+    assert metrics["rmse_speed/shrunk"] != metrics["rmse_speed/driver_specific"]
     assert metrics["rmse_speed/policy"] > 0.0
     assert "rmse_speed/shrunk" not in moved.metrics
 
@@ -188,7 +188,7 @@ def test_without_a_population_the_default_is_the_only_baseline_for_unseen_driver
     of_all: cfx.plugin.Result,
 ) -> None:
     result = of_all
-    assert set(result.pairs.method) == {"default", "fixed", "policy"}
+    assert set(result.pairs.method) == {"default", "driver_specific", "policy"}
     assert result.pairs[result.pairs.method == "policy"]["full_trajectory_rmse_speed"].notna().all()
 
 
@@ -234,7 +234,7 @@ def test_constant_parameters_are_not_tested_on_whom_they_were_calibrated_on(tmp_
     with pytest.raises(DataError, match="has learned from 3 of the 3 pairs"):
         Transfer(run=constant).finished.check(seen)
     there = transferred(constant, tmp_path)
-    assert set(there.pairs["method"]) == {"default", "population", "fixed"}
+    assert set(there.pairs["method"]) == {"default", "pooled", "driver_specific"}
 
 
 def test_other_time_steps_are_refused(saved: Transfer) -> None:

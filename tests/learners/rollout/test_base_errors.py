@@ -72,8 +72,8 @@ def test_networks_that_share_pairs_and_bases_share_their_errors() -> None:
 
 
 def test_errors_of_some_networks_are_those_of_all() -> None:
-    fixed = torch.tensor([[4.0, 0.8], [3.0, 0.5], [2.0, 0.2]]).double().repeat_interleave(6, 0)
-    data = training_data(networks=3, base=TRUE.repeat(3, 1), fixed=fixed)
+    start = torch.tensor([[4.0, 0.8], [3.0, 0.5], [2.0, 0.2]]).double().repeat_interleave(6, 0)
+    data = training_data(networks=3, base=TRUE.repeat(3, 1), start=start)
     dataset = placed(data, gru(), 0.0)
     whole = BaseErrors.of(data, dataset, 12)
     part, networks = whole.only(slice(1, 3)), dataset.only(slice(1, 3))

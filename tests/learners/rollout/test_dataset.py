@@ -60,7 +60,7 @@ def test_a_network_of_few_drivers_keeps_the_end_of_their_trajectories() -> None:
             index=data.pairs.index[:2],
             split=data.pairs.split[torch.arange(2)],
             network=data.pairs.network[:2],
-            fixed=data.pairs.fixed[:2],
+            start=data.pairs.start[:2],
             drivers=("a", "b"),
         ),
     )

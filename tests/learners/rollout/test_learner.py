@@ -55,7 +55,7 @@ def test_untrained_it_is_the_fixed_model(has_base: bool) -> None:
     """With the pooled base and with driver-specific ones, to the last bits."""
     own = TRUE.repeat(2, 1)
     policy, data = gru(), training_data(base=own)
-    expected = own if has_base else data.pairs.fixed
+    expected = own if has_base else data.pairs.start
     found = loop(untrained(data, policy), data, policy, first=100, base=own if has_base else None)
     constant = expected[:, None].expand_as(found.parameters)
     torch.testing.assert_close(found.parameters, constant, rtol=0, atol=1e-6)

@@ -16,17 +16,17 @@ from tests.learners.made import QUICK, gru, training_data
 @pytest.mark.parametrize("sites", [None, ("a", "b") * 6])
 def test_each_network_learns_from_them_beside_its_own_pairs(sites: tuple[str, ...] | None) -> None:
     data = training_data(networks=2, sites=sites)
-    data = replace(data, pairs=replace(data.pairs, base=data.pairs.fixed + 0.1))
+    data = replace(data, pairs=replace(data.pairs, base=data.pairs.start + 0.1))
     more = with_simulated_drivers(data, 5)
     recorded, found = len(data.recorded), more.pairs
     assert found.network.tolist() == [0] * 11 + [1] * 11
     assert found.index[:11].tolist() == found.index[11:].tolist() == list(range(11))
     kept = found.index < recorded
-    for name in ("index", "network", "fixed", "base"):
+    for name in ("index", "network", "start", "base"):
         assert torch.equal(getattr(found, name)[kept], getattr(data.pairs, name))
     assert torch.equal(found.split.frame[kept], data.pairs.split.frame)
     assert (found.split.frame[~kept] == more.recorded.lengths[recorded:].repeat(2) - 1).all()
-    assert torch.equal(found.base[~kept], data.pairs.fixed[:1].expand(10, -1))
+    assert torch.equal(found.base[~kept], data.pairs.start[:1].expand(10, -1))
     assert found.sites == ((sites or ("",) * 6)[:6] + (SITE,) * 5) * 2
     assert len(set(found.drivers or ())) == 11
     for name in (*RECORDED, "leader_length", "lengths", "mask"):

@@ -145,10 +145,10 @@ class TrafficProtocol(FoldsOrFinished):
     bottleneck at each demand, and in platoons behind leaders that keep their speed. Each vehicle is
     a test driver, drawn with replacement; every method has the same drivers at the same places:
 
-    - `population`: pooled parameters of all drivers, the same for every vehicle;
-    - `fixed`: the driver-specific parameters of the vehicle's driver;
-    - `population_ar`, `fixed_ar`: the same with AR(1) noise on the acceleration, measured on all
-      drivers, or on the driver, or as `noise` says;
+    - `pooled`: pooled parameters of all drivers, the same for every vehicle;
+    - `driver_specific`: the driver-specific parameters of the vehicle's driver;
+    - `pooled_ar`, `driver_specific_ar`: the same with AR(1) noise on the acceleration, measured on
+      all drivers, or on the driver, or as `noise` says;
     - `policy`: the policy, driven at its centre where it is stochastic;
     - `policy_sampled`: the same, drawn with the job's seed, of a stochastic policy.
 
@@ -281,10 +281,10 @@ class TrafficProtocol(FoldsOrFinished):
         s, context = self.settings, test.context
         kinds: dict[str, _Kind] = {}
         if context.stepper.model.has_constant_baseline:
-            constants = {"fixed": test.fixed}
+            constants = {"driver_specific": test.driver_specific}
             pooled = _pooled(test)
             if pooled is not None:
-                constants = {"population": pooled, **constants}
+                constants = {"pooled": pooled, **constants}
             for name, parameters in constants.items():
                 kinds |= _constant_kinds(test, name, parameters, s.noise)
         if context.policy.adapts or not kinds:
@@ -311,12 +311,12 @@ class TrafficProtocol(FoldsOrFinished):
 
 def _pooled(test: HeldOut) -> Tensor | None:
     """Returns the pooled parameters of all drivers for each test driver, `(P, n)`; None: none."""
-    if test.population is None:
+    if test.pooled is None:
         return None
     if ANY_DRIVER not in test.policy.names:
-        return test.population[test.network]
+        return test.pooled[test.network]
     number = test.policy.names.index(ANY_DRIVER)
-    return test.population[number].expand(len(test.pairs), -1)
+    return test.pooled[number].expand(len(test.pairs), -1)
 
 
 def _constant_kinds(
@@ -328,7 +328,7 @@ def _constant_kinds(
     agent = context.constant(FixedPolicy(), parameters)
     kinds = {name: _Kind(agent, agent.begin(each), draws=False)}
     if noise is None:
-        time, scale = residual_noise(test, parameters, own=name == "fixed")
+        time, scale = residual_noise(test, parameters, own=name == "driver_specific")
         log.info(
             "Noise of %s_ar as measured: %.2f m/s2 that lasts %.1f s",
             name,

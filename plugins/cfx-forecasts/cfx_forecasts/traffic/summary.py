@@ -11,18 +11,18 @@ import pandas as pd
 from cfx.plugin import RECORDED
 
 TRAFFIC_METHODS = (
-    "population",
-    "population_ar",
-    "fixed",
-    "fixed_ar",
+    "pooled",
+    "pooled_ar",
+    "driver_specific",
+    "driver_specific_ar",
     "policy",
     "policy_sampled",
 )
 """What drives in traffic, in the order in which it is shown.
 
-`population`: pooled parameters, the same for every vehicle.
-`fixed`: driver-specific parameters; each vehicle has those of a recorded driver.
-`population_ar`, `fixed_ar`: the same with AR(1) noise on the acceleration, as measured.
+`pooled`: pooled parameters, the same for every vehicle.
+`driver_specific`: driver-specific parameters; each vehicle has those of a recorded driver.
+`pooled_ar`, `driver_specific_ar`: the same with AR(1) noise on the acceleration, as measured.
 `policy`: the policy, nothing drawn; each vehicle is a recorded driver that it has observed.
 `policy_sampled`: the same, with all that a stochastic policy leaves to chance.
 """

@@ -53,5 +53,5 @@ def test_contract_with_a_finished_policy(traffic: TrafficProtocol) -> None:
 def test_the_finished_policy_is_set_on_roads(drawn: Path, tmp_path: Path) -> None:
     result = job(FINISHED, drawn, tmp_path / "job")
     roads = pd.read_parquet(result.folder / "traffic.parquet")
-    assert {"population", "fixed", "policy", "policy_sampled"} <= set(roads["method"])
+    assert {"pooled", "driver_specific", "policy", "policy_sampled"} <= set(roads["method"])
     assert result.metrics["traffic/capacity/policy"] > 0

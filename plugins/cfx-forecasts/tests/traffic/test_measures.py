@@ -125,16 +125,19 @@ def test_flows_are_compared_in_the_bins_that_both_have() -> None:
             strips("real", 33.0, 1500.0),
             strips("real", 45.0, 1200.0),
             strips("real", 75.0, 700.0),
-            strips("fixed", 37.0, 1600.0),
-            strips("fixed", 45.0, 1000.0),
-            strips("fixed", 75.0, 100.0, count=3),
+            strips("driver_specific", 37.0, 1600.0),
+            strips("driver_specific", 45.0, 1000.0),
+            strips("driver_specific", 75.0, 100.0, count=3),
         ]
     )
     bins = binned(table)
     assert set(bins["density"]) == {35.0, 45.0, 75.0}
-    assert flow_errors(bins)["fixed"] == pytest.approx(math.sqrt((100**2 + 200**2) / 2))
-    assert common_variation(bins) == {"real": pytest.approx(0.3), "fixed": pytest.approx(0.3)}
-    assert flow_errors(bins[bins["method"] == "fixed"]) == {}
+    assert flow_errors(bins)["driver_specific"] == pytest.approx(math.sqrt((100**2 + 200**2) / 2))
+    assert common_variation(bins) == {
+        "real": pytest.approx(0.3),
+        "driver_specific": pytest.approx(0.3),
+    }
+    assert flow_errors(bins[bins["method"] == "driver_specific"]) == {}
 
 
 def test_the_flow_of_a_bin_is_that_of_all_strips_together() -> None:

@@ -27,7 +27,7 @@ from tests.pages import Page
 
 
 def make_traffic(
-    methods: tuple[str, ...] = ("population", "fixed_ar", "policy"),
+    methods: tuple[str, ...] = ("pooled", "driver_specific_ar", "policy"),
 ) -> dict[str, pd.DataFrame]:
     """Traffic of made-up vehicles: each method's flows and variations are of another size."""
     rng = np.random.default_rng(0)
@@ -104,7 +104,7 @@ def test_traffic_has_a_plot_and_a_table(tmp_path: Path) -> None:
         "real",
     ]
     pooled, *_, real = sheet.rows
-    assert pooled[1].text == f"{found['traffic/capacity/population']:.0f}"
+    assert pooled[1].text == f"{found['traffic/capacity/pooled']:.0f}"
     assert real[4].text == f"{MINUS}14.0"
 
 

@@ -38,7 +38,7 @@ TRAFFIC = [
     "protocol.duration=40",
     "protocol.settle=10",
 ]
-CONSTANT = {"population", "population_ar", "fixed", "fixed_ar"}
+CONSTANT = {"pooled", "pooled_ar", "driver_specific", "driver_specific_ar"}
 
 
 @pytest.fixture(scope="module")
@@ -72,22 +72,22 @@ def test_traffic_stands_in_every_table(result: cfx.plugin.Result) -> None:
     assert list(paths.columns) == list(PATH_COLUMNS)
     assert set(strips["method"]) == {*CONSTANT, "real"}
     assert bool((growth.loc[growth["vehicle"] == 0, "speed_std"] == 0).all())
-    last = growth[(growth["method"] == "fixed_ar") & (growth["vehicle"] == 3)]
-    value = result.metrics["traffic/growth_last/fixed_ar"]
+    last = growth[(growth["method"] == "driver_specific_ar") & (growth["vehicle"] == 3)]
+    value = result.metrics["traffic/growth_last/driver_specific_ar"]
     assert value == pytest.approx(last["speed_std"].item())
     assert value > 0
     # The path of a ring goes around it.
     assert paths["place"].between(0, 6 * 1000 / 60, inclusive="both").all()
     roads = pd.read_parquet(result.folder / "traffic.parquet")
-    rings = roads[(roads["method"] == "fixed") & (roads["road"] == "ring")]
+    rings = roads[(roads["method"] == "driver_specific") & (roads["road"] == "ring")]
     capacity = rings.groupby("level")["flow"].mean().max()
-    assert result.metrics["traffic/capacity/fixed"] == pytest.approx(capacity)
+    assert result.metrics["traffic/capacity/driver_specific"] == pytest.approx(capacity)
     console = Console(file=io.StringIO(), width=80)
     console.print(*Roads().console(result.evaluation, result.metrics))
     assert isinstance(console.file, io.StringIO)
     shown = console.file.getvalue()
     assert f"{capacity:.0f}" in shown
-    assert "population_ar" in shown
+    assert "pooled_ar" in shown
 
 
 def test_the_same_seed_gives_the_same_traffic(

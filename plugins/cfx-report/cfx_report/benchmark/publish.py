@@ -46,15 +46,15 @@ _SITE_COLUMNS = (
     "site",
     "driver_type",
     "drivers",
-    "rmse_speed_fixed",
-    "rmse_speed_population",
+    "rmse_speed_driver_specific",
+    "rmse_speed_pooled",
     "rmse_speed_policy",
-    "over_fixed",
-    "over_fixed_low",
-    "over_fixed_high",
-    "over_population",
-    "over_population_low",
-    "over_population_high",
+    "over_driver_specific",
+    "over_driver_specific_low",
+    "over_driver_specific_high",
+    "over_pooled",
+    "over_pooled_low",
+    "over_pooled_high",
 )
 
 
@@ -137,7 +137,7 @@ def _train(name: str, data: Path, job: Path) -> None:
 
 def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
     """Returns the card: plain data."""
-    improvement = "full_trajectory/rmse_improvement/population"
+    improvement = "full_trajectory/improvement/rmse_speed/pooled"
     return {
         "name": name,
         "summary": RECIPES[name].summary,
@@ -154,7 +154,7 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
         "evaluation": _evaluation(RECIPES[name].recordings),
         "errors_on_unseen_drivers": {
             "rmse_speed": metrics["full_trajectory/rmse_speed/policy"],
-            "rmse_speed_pooled": metrics["full_trajectory/rmse_speed/population"],
+            "rmse_speed_pooled": metrics["full_trajectory/rmse_speed/pooled"],
             "rmse_gap": metrics["full_trajectory/rmse_gap/policy"],
             "improvement_over_pooled": metrics[f"{improvement}/geometric"],
             "improvement_over_pooled_ci95": [
@@ -162,7 +162,9 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
                 metrics[f"{improvement}/ci95_high"],
             ],
             "last_part_rmse_speed": metrics["rmse_speed/policy"],
-            "last_part_improvement_over_own": metrics["rmse_improvement/geometric"],
+            "last_part_improvement_over_own": metrics[
+                "improvement/rmse_speed/driver_specific/geometric"
+            ],
         },
         "expected_error": _expected(agent),
         "distributions": _distributions(metrics),
@@ -368,10 +370,10 @@ def _site_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
         cells = [
             name,
             f"{row['drivers']:.0f}",
-            _errors(row, "fixed"),
-            _gain(row, "over_fixed"),
-            _errors(whole, "population"),
-            _gain(whole, "over_population"),
+            _errors(row, "driver_specific"),
+            _gain(row, "over_driver_specific"),
+            _errors(whole, "pooled"),
+            _gain(whole, "over_pooled"),
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return [*lines, ""]

@@ -138,7 +138,7 @@ RECIPES = {
             "model=idm",
             "learner.drivers=32",
             "learner.cold_start_fraction=1.0",
-            "protocol.base=population",
+            "protocol.base=pooled",
             "protocol.history=0.0",
             *_I80,
         ),

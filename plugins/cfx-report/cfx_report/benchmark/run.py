@@ -180,7 +180,7 @@ def _run_job(command: Sequence[str], job: Path) -> None:
 def _method(job: Path) -> str:
     """Returns whose errors count: the policy's, or those of pooled constant parameters."""
     about = json.loads((job / "data.json").read_text(encoding="utf-8"))
-    return "population" if about["purpose"] == "calibration" else "policy"
+    return "pooled" if about["purpose"] == "calibration" else "policy"
 
 
 def _as_file_name(name: str) -> str:

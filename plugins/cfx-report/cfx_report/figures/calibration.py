@@ -107,7 +107,7 @@ def fits_of(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     found: dict[str, pd.DataFrame] = {}
     if "test_rmse_speed" not in table:
         return found
-    for method in ("fixed", "population", "default"):
+    for method in ("driver_specific", "pooled", "default"):
         rows = table[table["method"] == method]
         known = np.isfinite(rows[errors].to_numpy(dtype=float)).all(axis=1)
         if known.any():
@@ -136,7 +136,9 @@ def labels_of(
             names.append(axis.name)
     if labels.empty or not names:
         return {}
-    own = pairs[pairs["method"] == "fixed"].drop_duplicates("pair_id").set_index("pair_id")
+    own = (
+        pairs[pairs["method"] == "driver_specific"].drop_duplicates("pair_id").set_index("pair_id")
+    )
     ids = labels["pair_id"].astype(str)
     known = []
     for one in own.index.astype(str):
@@ -155,7 +157,7 @@ def labels_of(
 
 
 _ACROSS = 5
-_MARKERS = {"fixed": "o", "population": "D", "default": "|"}
+_MARKERS = {"driver_specific": "o", "pooled": "D", "default": "|"}
 
 
 @canvas.styled
@@ -167,7 +169,11 @@ def draw_slices(panels: Sequence[SlicePanel]) -> Figure:
     grid = figure.subplots(rows, across, squeeze=False, sharey=True)
     for place, panel in zip(grid.flat, panels, strict=False):
         place.plot(
-            panel.places, panel.lines.T, color=colours.colour_of("fixed"), alpha=0.15, linewidth=0.8
+            panel.places,
+            panel.lines.T,
+            color=colours.colour_of("driver_specific"),
+            alpha=0.15,
+            linewidth=0.8,
         )
         place.plot(panel.places, panel.median, color=colours.INK, linewidth=2)
         place.axhline(
@@ -204,7 +210,7 @@ def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
     for method, rows in fits.items():
         train = rows["train_rmse_speed"].to_numpy(dtype=float)
         test = rows["test_rmse_speed"].to_numpy(dtype=float)
-        own, colour = method == "fixed", colours.colour_of(method)
+        own, colour = method == "driver_specific", colours.colour_of(method)
         highest = max(highest, float(np.quantile(np.concatenate([train, test]), 0.98)))
         medians = f"median {np.median(train):.2f} and {np.median(test):.2f} m/s"
         size, above, filled = (4.5, 3, colour) if own else (5.5, 2, "none")
@@ -248,7 +254,7 @@ def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis
             linewidths=0,
         )
         fixed = float(labels[f"fixed_{axis.name}"].iloc[0])
-        place.axhline(fixed, color=colours.colour_of("fixed"), linewidth=1.6)
+        place.axhline(fixed, color=colours.colour_of("driver_specific"), linewidth=1.6)
         place.set_ylabel(
             wording.unit_label(axis.name, axis.unit).replace(" ", "\n"),
             fontsize=canvas.points(9),

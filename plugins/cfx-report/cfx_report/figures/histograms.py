@@ -50,12 +50,12 @@ def _histogram(axes: Axes, spread: parameter_spread.ParameterSpread) -> None:
         counts,
         width=np.diff(edges),
         align="edge",
-        color=colours.colour_of("fixed"),
+        color=colours.colour_of("driver_specific"),
         edgecolor="white",
         linewidth=canvas.points(0.5),
-        label=wording.method_label("fixed"),
+        label=wording.method_label("driver_specific"),
     )
-    marks = {"default": np.array([spread.default]), "population": spread.pooled}
+    marks = {"default": np.array([spread.default]), "pooled": spread.pooled}
     for method, values in marks.items():
         for number, value in enumerate(values):
             axes.axvline(

@@ -6,15 +6,10 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cfx.plugin import JobFigure, Result, canvas, colours, improvement_bars
+from cfx.plugin import JobFigure, Result, canvas, colours, improvement_bars, wording
 
-BASES = {"own": "fixed", "population": "population"}
-"""The method whose colour a base has: the parameters that the policy's answers are offsets from."""
-
-BASE_LABELS = {
-    "own": "offsets from driver-specific calibration",
-    "population": "offsets from pooled calibration",
-}
+BASES = ("driver_specific", "pooled")
+"""The parameters that a policy's answers are offsets from, in the order in which they are shown."""
 
 
 def history_curves(history: pd.DataFrame) -> pd.DataFrame:
@@ -24,8 +19,9 @@ def history_curves(history: pd.DataFrame) -> pd.DataFrame:
         history: as `Evaluation.history`.
 
     Returns:
-        A row per base and amount, each in its order: `base`, `amount`, `mean`, `low` and `high`
-        (fractions; mean over pairs and its 95 % interval), `pairs` with a defined improvement.
+        A row per base and amount, each in its order: `base`, `amount`, `geometric`, `low` and
+        `high` (fractions; the improvement and its 95 % interval over drivers), `pairs` with a
+        defined improvement.
     """
     from cfx.plugin import statistics  # imports scipy
 
@@ -34,10 +30,12 @@ def history_curves(history: pd.DataFrame) -> pd.DataFrame:
         for amount in amounts_of(history):
             chosen = history[(history["base"] == base) & (history["amount"] == amount)]
             if len(chosen):
-                gains = chosen["improvement"].astype(float).tolist()
-                interval = statistics.mean_interval(gains, chosen["driver"].astype(str).tolist())
-                rows.append((str(base), amount, *interval, int(np.isfinite(gains).sum())))
-    return pd.DataFrame(rows, columns=["base", "amount", "mean", "low", "high", "pairs"])
+                ratios = 1.0 - chosen["improvement"].to_numpy(dtype=float)
+                drivers = chosen["driver"].astype(str).tolist()
+                one = statistics.improvement_statistics(np.ones_like(ratios), ratios, drivers)
+                numbers = (one.geometric, one.ci95_low, one.ci95_high, one.pairs)
+                rows.append((str(base), amount, *numbers))
+    return pd.DataFrame(rows, columns=["base", "amount", "geometric", "low", "high", "pairs"])
 
 
 def amounts_of(history: pd.DataFrame) -> list[str]:
@@ -50,13 +48,12 @@ def amounts_of(history: pd.DataFrame) -> list[str]:
 
 
 def _place_of_base(base: str) -> tuple[int, str]:
-    known = list(BASES)
-    return (known.index(base) if base in known else len(known), base)
+    return (BASES.index(base) if base in BASES else len(BASES), base)
 
 
 @canvas.styled
 def draw_history(history: pd.DataFrame) -> Figure:
-    """Draw the mean improvement and its 95 % interval against the amount of burn-in.
+    """Draw the improvement and its 95 % interval against the amount of burn-in.
 
     Args:
         history: as `Evaluation.history`.
@@ -69,26 +66,26 @@ def draw_history(history: pd.DataFrame) -> Figure:
         curve = curves[curves["base"] == base]
         aside = 0.06 * (k - 0.5 * (len(bases) - 1))
         places = np.array([amounts.index(amount) for amount in curve["amount"]]) + aside
-        mean, low, high = (curve[name].to_numpy(dtype=float) for name in ("mean", "low", "high"))
+        middle, low, high = curve[["geometric", "low", "high"]].to_numpy(dtype=float).T
         axes.errorbar(
             places,
-            mean,
-            np.nan_to_num(np.stack([mean - low, high - mean])),
-            color=colours.COLOURS.get(BASES.get(base, ""), colours.INK),
+            middle,
+            np.nan_to_num(np.stack([middle - low, high - middle])),
+            color=colours.COLOURS.get(base, colours.INK),
             marker="o",
             linewidth=1.8,
             capsize=4,
-            label=BASE_LABELS.get(base, base),
+            label=f"offsets from {wording.method_label(base)}",
         )
     axes.axhline(0, color=colours.INK, linewidth=0.9)
     axes.set_xticks(range(len(amounts)), amounts)
     axes.set_xlim(-0.4, len(amounts) - 0.6)
     axes.set_xlabel("burn-in: measured history before the test part")
     axes.set_ylabel(
-        improvement_bars.improvement_title("fixed").replace(" over ", "\nover ") + " (%)"
+        improvement_bars.improvement_title("driver_specific").replace(" over ", "\nover ") + " (%)"
     )
     canvas.percent_axis(axes)
-    title = "mean over pairs and its 95 % interval"
+    title = "geometric over drivers, and its 95 % interval"
     canvas.legend_above(figure, columns=2, title=title)
     return figure
 
@@ -99,8 +96,8 @@ class History(JobFigure):
     title = "Improvement by the amount of burn-in"
     caption = (
         "Before the test part, the policy is fed with measured history of the driver, its burn-in."
-        " Here the same test part after less and after more of it: mean improvement over"
-        " driver-specific calibration, with its 95 % interval."
+        " Here the same test part after less and after more of it: the improvement over"
+        " driver-specific calibration, with its 95 % interval over drivers."
     )
     order = 100
 

@@ -26,7 +26,7 @@ from cfx.plugin import (
 _ACROSS = 5
 
 _KINDS = (
-    ("determined", "fixed", 1.0),
+    ("determined", "driver_specific", 1.0),
     ("hardly narrower than before the recording", "default", 0.6),
     ("not to be relied on", "population", 1.0),
 )
@@ -39,7 +39,7 @@ def interval_rows(fits: pd.DataFrame) -> pd.DataFrame:
     """Returns the rows of a job's table `fits` that have intervals."""
     if "effective_samples" not in fits:
         return fits.iloc[:0]
-    return fits[(fits["method"] == "fixed") & fits["effective_samples"].notna()]
+    return fits[(fits["method"] == "driver_specific") & fits["effective_samples"].notna()]
 
 
 @canvas.styled
@@ -133,7 +133,7 @@ def draw_pairs(
             else:
                 if prior is not None:
                     _scatter(place, prior.head(len(draws)), horizontal, vertical, "default")
-                _scatter(place, draws, horizontal, vertical, "fixed")
+                _scatter(place, draws, horizontal, vertical, "driver_specific")
                 _limits(place.set_ylim, vertical)
                 place.yaxis.set_major_locator(MaxNLocator(3))
             place.xaxis.set_major_locator(MaxNLocator(3))
@@ -168,7 +168,11 @@ def _densities(
     both = draws[name] if prior is None else pd.concat([draws[name], prior[name]])
     edges = np.histogram_bin_edges(both.to_numpy(dtype=float), bins=30).tolist()
     place.hist(
-        draws[name], bins=edges, density=True, color=colours.colour_of("fixed"), label=_AFTER
+        draws[name],
+        bins=edges,
+        density=True,
+        color=colours.colour_of("driver_specific"),
+        label=_AFTER,
     )
     if prior is not None:
         colour = colours.colour_of("default")
@@ -192,7 +196,7 @@ def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
     low, middle, high, measured = (
         rows[name].to_numpy(dtype=float) for name in ("low", "median", "high", "measured")
     )
-    colour = colours.colour_of("fixed")
+    colour = colours.colour_of("driver_specific")
     place.fill_between(
         time,
         low,

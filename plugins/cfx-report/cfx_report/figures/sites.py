@@ -10,7 +10,7 @@ from matplotlib.ticker import FuncFormatter
 
 from cfx.plugin import ALL_SITES, JobFigure, Result, canvas, colours, wording
 
-_PANELS = (("test", "fixed"), ("full_trajectory", "population"))
+_PANELS = (("test", "driver_specific"), ("full_trajectory", "pooled"))
 """Which part of trajectories is compared with what, one panel each."""
 
 _WORST = -1.0

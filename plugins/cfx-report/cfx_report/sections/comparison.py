@@ -42,16 +42,16 @@ _PLATOON = (
 )
 
 _SAFETY = (
-    ("collisions", wording.TEST, "fixed", ".0f", "Collisions"),
-    ("collisions", wording.FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
-    ("hard_braking", wording.TEST, "fixed", ".0f", "Hard braking"),
-    ("hard_braking", wording.FULL_TRAJECTORY, "population", ".0f", "full trajectory"),
-    ("jerk", wording.TEST, "fixed", ".2f", "Jerk (m/s³)"),
-    ("at_bounds", wording.TEST, "fixed", ".0%", "At bounds"),
-    ("platoon/head_to_tail", wording.TEST, "population", ".2f", "Amplification"),
-    ("platoon/string_stable", wording.TEST, "population", ".0%", "Stable"),
-    ("platoon/min_gap", wording.TEST, "population", ".1f", "Least gap (m)"),
-    ("platoon/collisions", wording.TEST, "population", ".0f", "Collisions"),
+    ("collisions", wording.TEST, "driver_specific", ".0f", "Collisions"),
+    ("collisions", wording.FULL_TRAJECTORY, "pooled", ".0f", "full trajectory"),
+    ("hard_braking", wording.TEST, "driver_specific", ".0f", "Hard braking"),
+    ("hard_braking", wording.FULL_TRAJECTORY, "pooled", ".0f", "full trajectory"),
+    ("jerk", wording.TEST, "driver_specific", ".2f", "Jerk (m/s³)"),
+    ("at_bounds", wording.TEST, "driver_specific", ".0%", "At bounds"),
+    ("platoon/head_to_tail", wording.TEST, "pooled", ".2f", "Amplification"),
+    ("platoon/string_stable", wording.TEST, "pooled", ".0%", "Stable"),
+    ("platoon/min_gap", wording.TEST, "pooled", ".1f", "Least gap (m)"),
+    ("platoon/collisions", wording.TEST, "pooled", ".0f", "Collisions"),
 )
 """Measures: metric, part of the trajectories, baseline that stands below, format, heading."""
 
@@ -77,10 +77,10 @@ _ERRORS = (
 )
 
 _GAINS = (
-    ("fixed", wording.TEST),
+    ("driver_specific", wording.TEST),
     ("shrunk", wording.TEST),
-    ("population", wording.TEST),
-    ("population", wording.FULL_TRAJECTORY),
+    ("pooled", wording.TEST),
+    ("pooled", wording.FULL_TRAJECTORY),
 )
 
 _JOB = Column[Result]("Job", lambda job: job.name)
@@ -192,7 +192,11 @@ def every_metric(jobs: Sequence[Result]) -> Sheet | None:
         better = "" if metric.direction == "none" else f" The {metric.direction} the better."
         meaning = f"{metric.meaning}, {metric.summary} over pairs.{better}"
         cell = partial(
-            _with_baseline, metric=metric.name, scope=wording.TEST, baseline="fixed", form=".3g"
+            _with_baseline,
+            metric=metric.name,
+            scope=wording.TEST,
+            baseline="driver_specific",
+            form=".3g",
         )
         columns.append(Column(metric_title(metric), cell, meaning))
     return Sheet.of(columns, jobs) if known else None

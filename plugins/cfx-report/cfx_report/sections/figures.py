@@ -16,7 +16,7 @@ from cfx.plugin import (
     style,
     wording,
 )
-from cfx_report.figures.history import BASE_LABELS, history_curves
+from cfx_report.figures.history import history_curves
 from cfx_report.jobs import Runs, are_calibrations, of_purpose
 from cfx_report.section import MOST, Column, Section, Sheet, View, interval, job_names, number
 
@@ -155,7 +155,7 @@ _AMOUNTS: tuple[Column[dict[str, Any]], ...] = (
     Column("Job", lambda row: row["job"]),
     Column(
         "Base",
-        lambda row: BASE_LABELS.get(row["base"], str(row["base"])),
+        lambda row: wording.method_label(row["base"]),
         "What the policy's answers are offsets from.",
     ),
     Column(
@@ -164,14 +164,14 @@ _AMOUNTS: tuple[Column[dict[str, Any]], ...] = (
         "Measured history before the test part; a share is of the full trajectory.",
     ),
     Column(
-        "Mean",
-        lambda row: number(row["mean"], "+.1%"),
-        "Mean improvement of the RMSE of speed over driver-specific calibration, test part.",
+        "Improvement",
+        lambda row: number(row["geometric"], "+.1%"),
+        "Over driver-specific calibration on the test part, geometric over drivers.",
     ),
     Column(
         "95 % interval",
         lambda row: interval(row["low"], row["high"]),
-        "Confidence interval of the mean, over drivers with all their pairs.",
+        "Confidence interval over drivers.",
     ),
     Column("Pairs", lambda row: number(row["pairs"], "d"), "Pairs whose improvement is defined."),
 )
@@ -264,7 +264,7 @@ def chosen_pairs(job: Result) -> tuple[pair_lines.RankedPair, ...]:
     if job.purpose is Purpose.CALIBRATION:
         gains = -table[f"rmse_speed/{job.judged}"].to_numpy(dtype=float)
     else:
-        gains = table["improvement/fixed"].to_numpy(dtype=float)
+        gains = table["improvement/driver_specific"].to_numpy(dtype=float)
     return pair_lines.rank_pairs(table["pair_id"].astype(str).tolist(), gains)
 
 
@@ -277,7 +277,7 @@ def _title(job: Result, pair: pair_lines.RankedPair) -> str:
     title = pair.title[:1].upper() + pair.title[1:]
     if job.purpose is Purpose.ADAPTATION and math.isfinite(pair.improvement):
         improvement = wording.percent(pair.improvement, 1)
-        title += f": {improvement} over {wording.short_label('fixed')} calibration"
+        title += f": {improvement} over {wording.short_label('driver_specific')} calibration"
     return title
 
 

@@ -30,10 +30,12 @@ def test_a_finished_job_is_published_without_training(
     metrics = json.loads((published / "metrics.json").read_text())
     on_card = card_of(name)["errors_on_unseen_drivers"]
     low, high = on_card["improvement_over_pooled_ci95"]
-    pooled = "full_trajectory/rmse_improvement/population"
+    pooled = "full_trajectory/improvement/rmse_speed/pooled"
     metrics |= {f"{pooled}/ci95_low": low, f"{pooled}/ci95_high": high}
     metrics[f"{pooled}/geometric"] = on_card["improvement_over_pooled"]
-    metrics["rmse_improvement/geometric"] = on_card["last_part_improvement_over_own"]
+    metrics["improvement/rmse_speed/driver_specific/geometric"] = on_card[
+        "last_part_improvement_over_own"
+    ]
     (job / "metrics.json").write_text(json.dumps(metrics))
     (job / "data.json").write_text(json.dumps({"fingerprint": "abc"}))
     monkeypatch.setattr(publish, "READY_FOLDER", folder)

@@ -60,8 +60,8 @@ def test_one_pair_and_the_middle_of_three_are_the_same_median() -> None:
 
 def test_the_mean_stays_in_view_unless_it_dwarfs_the_bars() -> None:
     values = np.array([0.2, 0.1, 0.15, 0.1, 0.12, -8.0])
-    near = improvement_axis(values, (-1.2,), baseline="fixed")
-    far = improvement_axis(values, (-5.0,), baseline="fixed")
+    near = improvement_axis(values, (-1.2,), baseline="driver_specific")
+    far = improvement_axis(values, (-5.0,), baseline="driver_specific")
     assert near.low == pytest.approx(-1.2)
     assert far.low == pytest.approx(WORST_WITHOUT_CUT)
     assert "the lowest is \N{MINUS SIGN}800 %" in far.note
@@ -96,9 +96,11 @@ def calibrated(values: list[float]) -> pd.DataFrame:
     """A table of pairs: driver-specific values of `tau`, `a` with the opposite order, defaults."""
     rows = []
     for value in values:
-        rows.append({"method": "fixed", "parameter_tau": value, "parameter_a": -(value**3)})
+        rows.append(
+            {"method": "driver_specific", "parameter_tau": value, "parameter_a": -(value**3)}
+        )
         rows.append({"method": "default", "parameter_tau": 1.0, "parameter_a": 0.0})
-        rows.append({"method": "population", "parameter_tau": 1.5, "parameter_a": 0.0})
+        rows.append({"method": "pooled", "parameter_tau": 1.5, "parameter_a": 0.0})
     return pd.DataFrame(rows)
 
 

@@ -59,7 +59,7 @@ def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
     """Returns results in which some pairs' improvements are replaced."""
     values = results.evaluation.values.copy()
     speed = values["metric"] == "rmse_speed"
-    before = values.loc[speed & (values["method"] == "fixed"), "value"].to_numpy()
+    before = values.loc[speed & (values["method"] == "driver_specific"), "value"].to_numpy()
     rows = values.index[speed & (values["method"] == "policy")]
     for k, value in gains.items():
         values.loc[rows[k], "value"] = before[k] * (1 - value)
@@ -72,7 +72,7 @@ def with_improvement(results: MadeUp, gains: dict[int, float]) -> Evaluation:
         pytest.param({"pairs": 1, "epochs": 1}, 10, marks=pytest.mark.slow),
         pytest.param({"pairs": 94, "frames": 40, "space": TEN}, 11, marks=pytest.mark.slow),
         ({"pairs": 2, "frames": 1, "networks": 0}, 9),
-        ({"pairs": 26, "methods": ("default", "population", "fixed", "policy")}, 11),
+        ({"pairs": 26, "methods": ("default", "pooled", "driver_specific", "policy")}, 11),
     ],
     ids=[
         "one pair",
@@ -136,7 +136,7 @@ def test_drives_shows_best_median_and_worst() -> None:
     one = drives(Result.of(evaluation), pair_id=ids[2])
     assert len(one.axes) == 2
     rows = evaluation.table[
-        (evaluation.table["pair_id"] == ids[2]) & (evaluation.table["method"] == "fixed")
+        (evaluation.table["pair_id"] == ids[2]) & (evaluation.table["method"] == "driver_specific")
     ]
     assert f"driver-specific {float(rows['rmse_speed'].iloc[0]):.2f}" in texts(one)
     colours = {line.get_color() for line in one.axes[0].lines}
@@ -170,9 +170,9 @@ def test_a_collision_is_marked_and_a_diverged_drive_is_survived() -> None:
         gap={
             **drive.gap,
             "policy": drive.real_gap - np.linspace(0, 20, 51),
-            "fixed": np.full(51, np.inf),
+            "driver_specific": np.full(51, np.inf),
         },
-        speed={**drive.speed, "fixed": np.full(51, np.nan)},
+        speed={**drive.speed, "driver_specific": np.full(51, np.nan)},
     )
     found = drives(Result.of(dataclasses.replace(evaluation, trajectories=(bad,))))
     found.canvas.draw()
@@ -260,11 +260,13 @@ def test_labels() -> None:
 
 def test_each_method_has_its_own_speed_plot() -> None:
     evaluation = make_results(
-        pairs=3, methods=("default", "population", "fixed", "policy")
+        pairs=3, methods=("default", "pooled", "driver_specific", "policy")
     ).evaluation
     found = drawn("speeds", Result.of(evaluation))
     assert len(found.axes) == 4
-    row = evaluation.table[evaluation.table["method"] == "population"].sort_values("improvement")
+    row = evaluation.table[evaluation.table["method"] == "pooled"].sort_values(
+        "improvement_over_driver_specific"
+    )
     assert any(f"{value:.3f} m/s" in texts(found) for value in row["rmse_speed"])
 
 
@@ -302,9 +304,9 @@ def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
     assert amounts_of(shortened) == ["0 s", "10 s", "80 %"]
     made = all_of(make_results(pairs=1, frames=5))
     (axes,) = drawn("history", dataclasses.replace(made, tables={"history": history})).axes
-    own, population = axes.containers
-    assert list(own.lines[0].get_ydata()) == pytest.approx([-0.1, 0.1, 0.2])
-    assert list(population.lines[0].get_ydata()) == pytest.approx([0.05])
+    own, pooled = axes.containers
+    assert list(own.lines[0].get_ydata()) == pytest.approx([-0.1, 0.1, 0.2], abs=1e-3)
+    assert list(pooled.lines[0].get_ydata()) == pytest.approx([0.05], abs=1e-3)
     (low, high) = own.lines[2][0].get_segments()[0][:, 1]
     assert low < -0.1 < high
 
@@ -326,7 +328,7 @@ def test_platoon_and_history_are_written_where_a_protocol_delivered_them(
 def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
     made = make_results(pairs=3, frames=20)
     values = made.evaluation.values
-    same = values[values["method"] == "fixed"].assign(method="policy")
+    same = values[values["method"] == "driver_specific"].assign(method="policy")
     values = pd.concat([values[values["method"] != "policy"], same], ignore_index=True)
     made = dataclasses.replace(
         made,
@@ -341,7 +343,9 @@ def test_a_policy_that_does_not_adapt_has_no_figure_of_improvements() -> None:
     assert "%" not in written
     assert "improvement" not in written
     assert "policy" not in texts(drawn("speeds", still))
-    errors = made.evaluation.table.query("method == 'fixed'").set_index("pair_id")["rmse_speed"]
+    errors = made.evaluation.table.query("method == 'driver_specific'").set_index("pair_id")[
+        "rmse_speed"
+    ]
     assert f"best pair, {errors.idxmin()}" in written.lower()
 
 

@@ -63,13 +63,17 @@ def everything() -> Result:
         [(ids[0], axis.name, place, place, 1 + place, 1.0) for place in (0.0, 0.5, 1.0)],
         columns=["pair_id", "parameter", "place", "value", "loss", "best_loss"],
     )
-    fits = pd.DataFrame({"pair_id": ids, "method": "fixed"})
+    fits = pd.DataFrame({"pair_id": ids, "method": "driver_specific"})
     labels = pd.DataFrame({"pair_id": ids[0], "time_s": [0.0, 0.5], "sensitivity": [0.1, 0.2]})
     sites = pd.DataFrame(
         [("test", "A", "all"), ("test", "A", "acc"), ("full_trajectory", "A", "all")],
         columns=["scope", "site", "driver_type"],
     )
-    gains = {"over_fixed": 0.1, "over_fixed_low": -0.1, "over_fixed_high": 0.2}
+    gains = {
+        "over_driver_specific": 0.1,
+        "over_driver_specific_low": -0.1,
+        "over_driver_specific_high": 0.2,
+    }
     tables = {
         "sites": sites.assign(**gains),
         "platoon": make_platoon({"policy": 2}).table,

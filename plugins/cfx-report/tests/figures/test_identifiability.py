@@ -42,7 +42,7 @@ def slices(pairs: list[str], names: tuple[str, ...] = ("T", "s0")) -> pd.DataFra
 FITS = pd.DataFrame(
     {
         "pair_id": ["a", "b", "a", "b"],
-        "method": ["default", "default", "fixed", "fixed"],
+        "method": ["default", "default", "driver_specific", "driver_specific"],
         "train_rmse_speed": [0.9, 0.8, 0.3, 0.4],
         "test_rmse_speed": [0.9, 0.7, 0.6, np.nan],
     }
@@ -60,7 +60,7 @@ LABELS = pd.DataFrame(
 )
 
 PAIRS = pd.DataFrame(
-    {"pair_id": ["a"], "method": ["fixed"], "parameter_T": [1.15], "parameter_s0": [2.0]}
+    {"pair_id": ["a"], "method": ["driver_specific"], "parameter_T": [1.15], "parameter_s0": [2.0]}
 )
 
 
@@ -83,8 +83,8 @@ def test_a_slice_without_a_finite_loss_is_left_out_or_infinite() -> None:
 
 def test_fits_have_the_pairs_that_are_defined_on_both_parts() -> None:
     fits = fits_of(FITS)
-    assert list(fits) == ["fixed", "default"]
-    assert fits["fixed"]["pair_id"].tolist() == ["a"]
+    assert list(fits) == ["driver_specific", "default"]
+    assert fits["driver_specific"]["pair_id"].tolist() == ["a"]
     assert fits["default"]["train_rmse_speed"].tolist() == [0.9, 0.8]
 
 

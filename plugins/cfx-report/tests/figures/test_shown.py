@@ -83,7 +83,7 @@ def test_parameters_have_their_limits_and_say_what_they_mean() -> None:
 
 
 def test_a_hidden_method_is_left_out() -> None:
-    methods = ("default", "fixed", "shrunk", "policy")
+    methods = ("default", "driver_specific", "shrunk", "policy")
     evaluation = make_results(pairs=1, frames=30, methods=methods).evaluation
     panels = pair_panels(evaluation.trajectories[0], methods, Result.of(evaluation).parameters)
     figure = draw_pairs([("", "", "")], [panels], methods)
@@ -93,7 +93,7 @@ def test_a_hidden_method_is_left_out() -> None:
 def test_improvements_are_cut_off_at_one_place() -> None:
     values = np.array([0.3, 0.25, 0.2, 0.1, np.nan, -0.1, -0.2, -7.0, 0.15, 0.05])
     ids = [f"p{k}" for k in range(10)]
-    summary = make_results(pairs=3).evaluation.improvements["test"]["fixed"]
+    summary = make_results(pairs=3).evaluation.improvements["test"]["driver_specific"]
     bars = improvement_bars(["job"], [ids], [values], marks=(summary.geometric,))
     (series,) = bars.series
     for figure in (draw_improvements(bars, summary), draw_every_pair(bars, series.pair_ids)):
@@ -150,7 +150,7 @@ def test_the_report_of_a_job_shows_the_pairs_of_its_figures(tmp_path: Path) -> N
     (job,) = read_runs([str(tmp_path)]).jobs
     evaluation = make_results(pairs=8, frames=40, epochs=12).evaluation
     rows = evaluation.table[evaluation.table["method"] == "policy"]
-    gains = rows["improvement"].to_numpy(dtype=float)
+    gains = rows["improvement_over_driver_specific"].to_numpy(dtype=float)
     ranked = rank_pairs(rows["pair_id"].tolist(), gains)
     assert [one.pair_id for one in chosen_pairs(job)] == [one.pair_id for one in ranked]
     for results in (Result.of(evaluation), job):
@@ -162,14 +162,14 @@ def test_the_report_of_a_job_shows_the_pairs_of_its_figures(tmp_path: Path) -> N
 
 def test_calibrated_parameters_have_their_places_and_correlations() -> None:
     evaluation = make_results(
-        pairs=9, frames=20, methods=("default", "population", "fixed")
+        pairs=9, frames=20, methods=("default", "pooled", "driver_specific")
     ).evaluation
     spreads = parameter_spreads(evaluation.table, Result.of(evaluation).parameters)
     table = correlations(evaluation.table, Result.of(evaluation).parameters)
     drawn, image = draw_calibration(spreads, table).axes[:2]
     places = []
     for line in drawn.lines:
-        if line.get_color() == colour_of("fixed"):
+        if line.get_color() == colour_of("driver_specific"):
             places.append(np.asarray(line.get_xdata(), dtype=float))
     for found, spread in zip(places, spreads, strict=True):
         np.testing.assert_allclose(found, spread.places(spread.values))

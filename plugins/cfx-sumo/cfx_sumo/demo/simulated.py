@@ -51,14 +51,14 @@ class PolicyKnowledge:
             is.
     """
 
-    base: str = "fixed"
+    base: str = "driver_specific"
     history: float | None = None
 
     @classmethod
     def of(cls, protocol: Mapping[str, Any]) -> PolicyKnowledge:
         """Reads a protocol's node; one that says nothing of it lets the policy know all."""
-        base = str(protocol.get("base", "own"))
-        return cls("fixed" if base == "own" else base, protocol.get("history"))
+        base = str(protocol.get("base", "driver_specific"))
+        return cls("driver_specific" if base == "own" else base, protocol.get("history"))
 
     def since(self, first: int, dt: float) -> int:
         """Returns the frame from which on the driver is known; `first` is that of the takeover."""
@@ -145,7 +145,7 @@ def _choose(
 ) -> list[PairTrajectory]:
     """Returns some pairs spread evenly from the best to the worst improvement."""
     policy = table[table["method"] == "policy"].set_index("pair_id")
-    improvement = policy["improvement"].astype(float).fillna(-np.inf).to_dict()
+    improvement = policy["improvement_over_driver_specific"].astype(float).fillna(-np.inf).to_dict()
     ranked = sorted(
         trajectories, key=lambda trajectory: -improvement.get(trajectory.pair_id, -np.inf)
     )

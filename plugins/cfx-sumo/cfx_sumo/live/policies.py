@@ -72,7 +72,7 @@ def constant_policy(model: DrivingModel, parameters: Mapping[str, float], dt: fl
         windows=WindowSettings(),
         dt=dt,
         names=(ANY_DRIVER,),
-        population=values[None],
+        pooled=values[None],
     )
 
 
