@@ -8,8 +8,8 @@ it says: it must be read equal to the clean one, or what is left out must be cou
 make it say something else: it must be refused, for the right reason. Read otherwise than it is
 meant and without a word: that is the bar, and there must be none.
 
-Prints a row for each corruption, and each file that was not answered right; `--page` writes the
-table of docs/hostile_files.md.
+Prints a row for each corruption, as docs/hostile_files.md has it, and each file that was not
+answered right.
 """
 
 from __future__ import annotations
@@ -474,7 +474,7 @@ NO_VALUES = "negative|leaps|acceleration is|behind|-9999|no vehicle length|again
 METRIC = tuple(name for name in LAYOUTS if name != "NGSIM")
 SI = ("tidy", "highD", "Waymo", "Lyft", "SUMO")
 FULL = ("tidy", "NGSIM", "highD", "Waymo", "Lyft", "SUMO")
-STEP = "time step|km/h|mph|ft/s|look like|times what|of this vehicle|by which another|agrees with"
+STEP = "time step|times in|steps differ"
 CASES: tuple[Case, ...] = (
     Case("decimal commas, semicolons", file=set_to(mark=",", separator=";"), layouts=TEXT),
     Case("decimal commas in quotes", file=set_to(mark=",", quoted=True), layouts=TEXT),
@@ -599,13 +599,13 @@ CASES: tuple[Case, ...] = (
     ),
     Case(
         "times in ms",
-        STEP + "|advances|seconds",
+        STEP,
         times(1000.0, "time"),
         layouts=("tidy", "tidy with gaps", "SUMO", "Waymo", "Lyft", "OpenACC"),
     ),
     Case(
         "every second row, numbered anew",
-        STEP + "|m,|ft",
+        STEP,
         renumbered,
         layouts=(
             "tidy",
