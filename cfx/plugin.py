@@ -17,6 +17,7 @@ MODULES = {
     "canvas": "cfx.figures.canvas",
     "colours": "cfx.figures.colours",
     "composed": "cfx.models.composed",
+    "comparison": "cfx.results.comparison",
     "console": "cfx.core.console",
     "curves": "cfx.learners.curves",
     "distributions": "cfx.core.distributions",

@@ -198,6 +198,7 @@ from .evaluation.tables import in_text as in_text
 
 # Results: tables of a job, its folder, where it is tracked
 from .core import job_folder as job_folder
+from .results import comparison as comparison
 from .results.config import JobConfig as JobConfig
 from .results.provenance import flatten as flatten
 from .results.figure import JobFigure as JobFigure

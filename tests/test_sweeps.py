@@ -31,10 +31,12 @@ JOB = """
     from dataclasses import dataclass
     from pathlib import Path
     from cfx.errors import DataError
+    from cfx.evaluation.metrics.base import RMSE_SPEED
 
     @dataclass
     class Result:
         metrics: dict
+        judge = RMSE_SPEED
 
     def run_job(config, folder):
         with Path("ran").open("a") as file:
@@ -337,13 +339,14 @@ def test_the_summary_compares_jobs_by_what_differs(run: Run, capsys) -> None:
         "",
     ]
     assert [row["improvement_geometric"] for row in table] == ["0.5", "0.5", "", ""]
-    assert [row["improvement_ci95_high"] for row in table] == ["", "", "", ""]
-    assert [row["rmse_speed_policy"] for row in table] == ["0.25", "0.25", "", ""]
+    assert "improvement_ci95_high" not in table[0], "no job has it"
+    assert [row["method"] for row in table] == ["policy", "policy", "", ""]
+    assert [row["error_rmse_speed"] for row in table] == ["0.25", "0.25", "", ""]
     assert table[2]["message"] == "drive 2 is broken"
     assert {row["folder"] for row in table} == {path.name for path in jobs(folder)}
     printed = capsys.readouterr().out
-    assert "improvement over driver-specific" in printed
-    assert "+50.0%" in printed
+    assert "over driver-specific" in printed
+    assert "+50.0 %" in printed
     assert f"python -m cfx report {folder}" in printed
 
 

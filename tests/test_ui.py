@@ -22,7 +22,8 @@ from cfx.results.mlflow.store import quiet
 from cfx.results.mlflow.tracker import MlflowTracker
 from tests.browser import Browser
 
-IMPROVEMENTS = {"krauss": 0.1234, "w99": 0.2345, "w74": -0.0567}
+RESULTS = {"krauss": (0.4321, 12.3), "w99": (0.3456, 23.4), "w74": (0.5678, -5.7)}
+"""By model the error, m/s, and the improvement, %."""
 SWEEP = "2026-05-04_10-11-12"
 
 
@@ -51,26 +52,19 @@ class Served:
 
 def fill(store: str) -> str:
     """Tracks a sweep of three jobs, a single one, and a killed one; returns the last one's id."""
-    for model, improvement in IMPROVEMENTS.items():
+    for model, (error, improvement) in RESULTS.items():
         tags = {"model": model, "policy": "gru", "learner": "rollout", "cfx.folder": model}
-        tags["result"] = f"{improvement:+.1%} over driver-specific"
+        tags |= {"result": f"{improvement:+.1f}% over driver-specific", "error": "rmse_speed_mps"}
         with MlflowTracker.run(
             store,
             run_name=f"{model}-gru",
-            parameters={"model.name": model, "seed": "0"},
+            parameters={"model": model, "seed": "0"},
             tags=tags,
             sweep=SWEEP,
         ) as run:
-            run.log_metrics(
-                {
-                    "improvement_percent": round(100 * improvement, 1),
-                    "improvement/rmse_speed/driver_specific/geometric": improvement,
-                    "rmse_speed/policy": 1.5,
-                    "rmse_speed/driver_specific": 1.75,
-                }
-            )
+            run.log_metrics({"improvement_percent": improvement, "rmse_speed_mps": error})
     with MlflowTracker.run(store, run_name="a single job", parameters={"seed": "7"}) as run:
-        run.log_metrics({"improvement/rmse_speed/driver_specific/geometric": 0.3})
+        run.log_metrics({"rmse_speed_mps": 0.3})
     with MlflowTracker.run(store, run_name="killed", parameters={}) as run:
         pass
     # What a killed process leaves: a run that says RUNNING, and by which process, long gone.
@@ -85,21 +79,22 @@ def fill(store: str) -> str:
     return run.run_id
 
 
-def a_run(model: str, seed: int, improvement: float) -> SimpleNamespace:
+def a_run(model: str, seed: int, error: float) -> SimpleNamespace:
     """Returns a job's run as MLflow gives it."""
-    metrics = {"improvement/rmse_speed/driver_specific/geometric": improvement}
-    data = SimpleNamespace(params={"model.name": model, "seed": str(seed)}, metrics=metrics)
+    metrics = {"rmse_speed_mps": error}
+    data = SimpleNamespace(params={"model": model, "seed": str(seed)}, metrics=metrics)
     return SimpleNamespace(data=data, info=SimpleNamespace(status="FINISHED"))
 
 
 def test_a_lucky_seed_is_not_the_best_of_a_sweep() -> None:
-    lucky = [a_run("w99", 0, 0.30), a_run("w99", 1, 0.01), a_run("w99", 2, math.nan)]
-    steady = [a_run("idm", 0, 0.20), a_run("idm", 1, 0.18)]
-    groups = _over_seeds([*lucky, *steady])
+    lucky = [a_run("w99", 0, 0.30), a_run("w99", 1, 0.60), a_run("w99", 2, math.nan)]
+    steady = [a_run("idm", 0, 0.40), a_run("idm", 1, 0.42)]
+    groups = _over_seeds([*lucky, *steady], "rmse_speed_mps")
     assert groups == [steady, lucky]
-    assert _best(groups[0]) == ", best improvement 19.0% (mean of 2 seeds)"
-    assert _best([lucky[0]]) == ", best improvement 30.0%"
-    assert _best([lucky[2]]) == ", FINISHED"
+    best = ", smallest rmse_speed_mps 0.410 (mean of 2 seeds)"
+    assert _best(groups[0], "rmse_speed_mps") == best
+    assert _best([lucky[0]], "rmse_speed_mps") == ", smallest rmse_speed_mps 0.300"
+    assert _best([lucky[2]], "rmse_speed_mps") == ", FINISHED"
 
 
 def free_port() -> int:
@@ -159,7 +154,7 @@ def test_what_is_printed_is_short_and_runs_of_killed_processes_are_closed(served
         "job a single job",
         "all jobs of experiment cfx",
     ]
-    assert printed[0].endswith(": 3 jobs, best improvement 23.4%")
+    assert printed[0].endswith(": 3 jobs, smallest rmse_speed_mps 0.346")
     assert len(printed) == 10
     assert any(line.startswith("job killed") and line.endswith(", KILLED") for line in printed)
     with quiet():
@@ -201,10 +196,11 @@ def test_a_browser_shows_the_sweeps_improvements_in_a_table_and_in_charts(
     names = page.locator("[role=gridcell][col-id='attributes.`Run Name`']").all_inner_texts()
     assert [name.split()[-1] for name in names] == ["w99-gru", "krauss-gru", "w74-gru"]
     page.goto(served.link("charts", "sweep"))
+    page.get_by_text("rmse_speed_mps", exact=True).first.wait_for()
+    # The first charts are the error and the improvement. Beside them only what differs.
     page.get_by_text("improvement_percent", exact=True).first.wait_for()
-    # The first chart is the improvement: the best job's bar. Beside it only what differs.
-    page.locator("svg").get_by_text("23.40", exact=True).first.wait_for()
-    page.get_by_text("model.name", exact=True).first.wait_for()
+    page.locator("svg").get_by_text("0.35", exact=True).first.wait_for()
+    page.get_by_text("model", exact=True).first.wait_for()
     assert page.get_by_text("seed", exact=True).count() == 0
     assert browser.over_network()
     assert browser.outside() == []
@@ -228,5 +224,5 @@ def test_a_browser_compares_a_sweeps_jobs_and_shows_all_jobs(
         "killed",
     ]
     page.goto(served.link("page", "job a single"))
-    page.get_by_text("improvement/rmse_speed/driver_specific/geometric").first.wait_for()
+    page.get_by_text("rmse_speed_mps").first.wait_for()
     assert browser.outside() == []

@@ -34,6 +34,7 @@ from cfx.app.sweep.folder import (
     JobStatus,
     Record,
     fingerprint,
+    judge_of_folder,
     metrics_of,
     new_folder,
     only_one,
@@ -91,7 +92,7 @@ class JobFunction:
         """Runs one job; one of a multirun that was done before is not run again.
 
         Returns:
-            The policy's RMSE of speed, m/s, for sweepers that optimise; NaN if the job failed.
+            The error by which the job is judged, for sweepers that optimise; NaN if it failed.
 
         Raises:
             JobFailedError: it failed, and the sweeper optimises: it counts failures.
@@ -146,7 +147,8 @@ class JobFunction:
                 if earlier and earlier.code == 0 and earlier.fingerprint == blank.fingerprint:
                     log.info("job %d (%s) was done before", blank.number, " ".join(blank.overrides))
                     status = replace(blank, seconds=earlier.seconds, before=True)
-                    return main_error(metrics_of(folder)), status
+                    judge = judge_of_folder(folder).name
+                    return main_error(metrics_of(folder), judge), status
                 (folder / STATUS).unlink(missing_ok=True)  # what it says is no longer so
             result = _run_job(values, folder, self.run_job)
         except (Exception, SystemExit) as error:
@@ -154,7 +156,8 @@ class JobFunction:
             if status.code == CfxError.exit_code:
                 status = replace(status, message=status.message + _preset_behind(status, values))
             return float("nan"), replace(status, seconds=time.monotonic() - began)
-        return main_error(result.metrics), replace(blank, seconds=time.monotonic() - began)
+        measured = main_error(result.metrics, result.judge.name)
+        return measured, replace(blank, seconds=time.monotonic() - began)
 
     def _failed(self, error: BaseException, blank: JobStatus) -> JobStatus:
         """Returns the status of a job that ended in an error; raises a signal that caused it."""

@@ -34,6 +34,7 @@ class SpeedHuber(SpeedRmse):
 
     schema: ClassVar[type[Settings]] = SpeedHuberSettings
     settings: SpeedHuberSettings
+    metric = ""
 
     def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
         error = frames.speed - frames.measured_speed

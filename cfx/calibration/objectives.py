@@ -57,6 +57,8 @@ class Objective(Component):
 
     Attributes:
         unit: the loss's unit, such as "m/s"; "" for a loss without unit.
+        metric: the metric that is the same number, such as "rmse_speed": jobs are judged by it. ""
+            where there is none: they are judged by the objective itself.
         signals: the signals that `terms` reads; the others are not computed for it.
         tie_tolerance: losses of a window that differ by less, in `unit`, count as equal where
             `windows.tie_tolerance` is null: about the accuracy of recorded trajectories.
@@ -67,6 +69,7 @@ class Objective(Component):
 
     kind = "objective"
     unit: ClassVar[str]
+    metric: str = ""
     signals: Sequence[Signal] = ("speed", "gap")
     tie_tolerance: ClassVar[float] = 0.0
     floor: ClassVar[float] = 0.0

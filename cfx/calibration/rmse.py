@@ -11,6 +11,7 @@ class SpeedRmse(Objective):
     """Root mean squared error of speed, m/s: the paper's objective."""
 
     unit = "m/s"
+    metric = "rmse_speed"
     signals = ("speed",)
     tie_tolerance = 0.05
     floor = 0.2
@@ -30,6 +31,7 @@ class GapRmse(Objective):
     """
 
     unit = "m"
+    metric = "rmse_gap"
     signals = ("gap",)
     tie_tolerance = 0.05
     floor = 1.0

@@ -36,6 +36,10 @@ class TheilInequality(Objective):
     def signals(self) -> Sequence[Signal]:  # type: ignore[override]  # it follows from the settings
         return (self.settings.signal,)
 
+    @property
+    def metric(self) -> str:  # type: ignore[override]  # it follows from the settings
+        return "theil_u" if self.settings.signal == "speed" else ""
+
     def terms(self, frames: FrameValues) -> tuple[Tensor, ...]:
         simulated, measured = frames.speed, frames.measured_speed
         if self.settings.signal == "gap":

@@ -189,7 +189,8 @@ def evaluate(
     if policy_space is None:
         policy_space = space
     spaces = dict.fromkeys(METHODS, space) | {"policy": policy_space}
-    measures = _Measures(metrics or MetricSet.own())
+    chosen = metrics or MetricSet.own()
+    measures = _Measures(chosen)
     for rows in parts_of(len(pairs)):
         whole = _rows(full_trajectory, rows)
         measures.add(_scopes(batch[rows], first[rows], _rows(loops, rows), whole, spaces))
@@ -198,7 +199,7 @@ def evaluate(
     values = long_table(pairs.ids, drivers, measured)
     improvements = {}
     for scope in ("test", "steady", "full_trajectory"):
-        of_scope = _improvements(values, scope, drivers)
+        of_scope = _improvements(values, chosen.judge, scope, drivers)
         if of_scope:
             improvements[scope] = of_scope
     simulated = SimulatedPairs(pairs, batch, first, loops)
@@ -210,6 +211,7 @@ def evaluate(
         trajectories=simulated if len(pairs) > PAIRS_AT_ONCE else tuple(simulated),
         parameters=policy_space.tuned,
         left_out=left_out,
+        judge=chosen.judge,
     )
 
 
@@ -287,6 +289,7 @@ class _Measures:
         self.frames: list[NDArray[np.int64]] = []
         self.parameters: dict[str, list[Array]] = {}
         self._metrics = list(metrics.metrics)
+        self._judge = metrics.judge
         self._left_out = list(metrics.left_out)
         self._values: dict[str, dict[tuple[str, str, str], list[Array]]] = {}
         self._scopes: Collection[str] = ()
@@ -299,7 +302,7 @@ class _Measures:
                 values = _values(one, scopes)
             # A plugin may raise anything, and must not cost the job its results.
             except Exception as error:
-                if one.distribution == OWN:
+                if one.distribution == OWN or one.name == self._judge:
                     raise
                 reason = in_words(error)
                 self._left_out.append(leave_out(one.name, one.distribution, reason))
@@ -320,8 +323,10 @@ class _Measures:
         for one in self._metrics:
             for key, parts in self._values[one.name].items():
                 measured[key] = np.concatenate(parts)
-        infos = tuple(one.info(self._scopes) for one in self._metrics)
-        return measured, infos, tuple(self._left_out)
+        infos = []
+        for one in self._metrics:
+            infos.append(one.info(self._scopes, judges=one.name == self._judge))
+        return measured, tuple(infos), tuple(self._left_out)
 
 
 @torch.no_grad()
@@ -341,19 +346,20 @@ def _values(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]
 
 
 def _improvements(
-    values: pd.DataFrame, scope: str, drivers: Sequence[str]
+    values: pd.DataFrame, judge: str, scope: str, drivers: Sequence[str]
 ) -> dict[str, Improvement]:
     """Returns the policy's improvement over every other method; empty if it was not simulated."""
-    speed = values_of(values, "rmse_speed", scope)
-    if "policy" not in speed:
+    errors = values_of(values, judge, scope)
+    if "policy" not in errors:
         return {}
-    policy = speed["policy"].to_numpy()
+    policy = errors["policy"].to_numpy()
     if scope == "steady" and not np.isfinite(policy).any():
         return {}
     improvements = {}
     for method in METHODS:
-        if method in speed and method != "policy":
-            improvements[method] = improvement_statistics(speed[method].to_numpy(), policy, drivers)
+        if method in errors and method != "policy":
+            before = errors[method].to_numpy()
+            improvements[method] = improvement_statistics(before, policy, drivers)
     return improvements
 
 

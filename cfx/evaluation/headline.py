@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from typing import NamedTuple
 
-from cfx.evaluation.metrics.base import key_of
+from cfx.evaluation.metrics.base import RMSE_SPEED, MetricInfo, key_of
 
 __all__ = [
     "summaries_disagree",
@@ -17,51 +17,72 @@ __all__ = [
 RESULT = "result"
 """The tag that says it in words."""
 
-PERCENT = "improvement_percent"
-SPEED_ERROR = "rmse_speed_mps"
-"""The two that charts begin with. No metric of the headline has a group: MLflow puts such first."""
+ERROR = "error"
+"""The tag with the name of the metric that a job is judged by, with its unit."""
 
-_JUDGED = {"rmse_gap_m": "rmse_gap", "collisions": "collisions"}
+DEFAULT_ERROR = "rmse_speed_mps"
+"""What `ERROR` says of a job whose objective is not known."""
+
+TESTED = "tested on"
+"""The tag that two jobs share that were tested on the same frames of the same pairs."""
+
+PERCENT = "improvement_percent"
+"""What charts begin with. No metric of the headline has a group: MLflow puts such first."""
+
+_ERRORS = {"rmse_speed": ("RMSE of speed", "m/s"), "rmse_gap": ("RMSE of gap", "m")}
+"""Heading and unit of the errors that a job tells beside the one that it is judged by."""
+
+_COUNTED = ("collisions", "hard_braking")
 """Further metrics of the method that a job is judged by."""
 
 _CONSTANT = {"driver_specific": "driver-specific", "pooled": "pooled", "default": "default"}
 """Constant parameters, the first of which is a calibration's number."""
 
 
-def improvement_key(baseline: str, scope: str = "test") -> str:
-    """Returns how the metrics of the improvement over a baseline begin."""
-    key = f"improvement/rmse_speed/{baseline}"
-    return key if scope == "test" else f"{scope}/{key}"
+def improvement_key(metric: str, baseline: str, scope: str = "test") -> str:
+    """Returns how the metrics of a metric's improvement over a baseline begin."""
+    return key_of(f"improvement/{metric}", baseline, scope)
+
+
+def with_unit(metric: str, unit: str) -> str:
+    """Returns how MLflow names a metric: `rmse_speed_mps`."""
+    return f"{metric}_{unit.replace('/', 'p')}" if unit else metric
 
 
 class Comparison(NamedTuple):
-    """What the policy is compared with: a baseline over a part of the trajectories."""
+    """What the policy is compared with: a baseline over a part of the trajectories, by a metric."""
 
+    metric: str
     baseline: str
     scope: str
 
     @property
     def key(self) -> str:
         """How the metrics of the improvement begin."""
-        return improvement_key(self.baseline, self.scope)
+        return improvement_key(self.metric, self.baseline, self.scope)
 
 
 _COMPARISONS = (
-    Comparison("driver_specific", "test"),
-    Comparison("pooled", "full_trajectory"),
-    Comparison("pooled", "test"),
+    ("driver_specific", "test"),
+    ("pooled", "full_trajectory"),
+    ("pooled", "test"),
 )
 """The first that was measured counts."""
 
 
-def main_comparison(metrics: Mapping[str, float]) -> Comparison | None:
+def main_comparison(metrics: Mapping[str, float], judge: str) -> Comparison | None:
     """Returns the comparison that counts: over driver-specific parameters on the test part.
 
     Where there are none it is over pooled ones, on full trajectories; None if there is nothing.
+
+    Args:
+        metrics: the job's.
+        judge: the metric by which the job is judged.
     """
-    for one in _COMPARISONS:
-        if math.isfinite(metrics.get(f"{one.key}/geometric", math.nan)):
-            return one
+    for baseline, scope in _COMPARISONS:
+        compared = Comparison(judge, baseline, scope)
+        if math.isfinite(metrics.get(f"{compared.key}/geometric", math.nan)):
+            return compared
     return None
 
 
@@ -91,92 +112,111 @@ FEW_DRIVERS = 10
 """Of fewer drivers than these an improvement says little about others."""
 
 
-def doubts(metrics: Mapping[str, float], compared: Comparison) -> list[str]:
-    """Returns what is to be known beside an improvement, as parts of a sentence."""
-    geometric = metrics.get(f"{compared.key}/geometric", math.nan)
-    note = summaries_disagree(geometric, metrics.get(f"{compared.key}/ratio_of_means", math.nan))
+def doubts(statistics: Mapping[str, float]) -> list[str]:
+    """Returns what is to be known beside an improvement, as parts of a sentence.
+
+    Args:
+        statistics: of the improvement, by name: those that are known.
+    """
+    ratio_of_means = statistics.get("ratio_of_means", math.nan)
+    note = summaries_disagree(statistics.get("geometric", math.nan), ratio_of_means)
     parts = [note] if note else []
-    drivers = metrics.get(f"{compared.key}/drivers", math.nan)
+    drivers = statistics.get("drivers", math.nan)
     if drivers < FEW_DRIVERS:
         parts.append("one driver" if drivers == 1 else f"{drivers:.0f} drivers")
     return parts
 
 
-def main_error(metrics: Mapping[str, float]) -> float:
-    """Returns the RMSE of speed of the method that a job is judged by."""
+def main_error(metrics: Mapping[str, float], judge: str) -> float:
+    """Returns the error that a job is judged by: the policy's; of a calibration its own set's.
+
+    Args:
+        metrics: the job's.
+        judge: the metric by which the job is judged.
+    """
     for method in ("policy", *_CONSTANT):
-        error = metrics.get(key_of("rmse_speed", method), math.nan)
+        error = metrics.get(key_of(judge, method), math.nan)
         if math.isfinite(error):
             return error
     return math.nan
 
 
-def headline(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
+def headline(
+    metrics: Mapping[str, float], judge: MetricInfo = RMSE_SPEED
+) -> tuple[dict[str, float], str]:
     """Returns a job's headline.
 
     A job without a method `policy` is a calibration.
 
     Args:
         metrics: the job's, under their names in MLflow.
+        judge: the error by which the job is judged.
 
     Returns:
         Metrics, rounded; and the result in words.
     """
-    if key_of("rmse_speed", "policy") not in metrics and main_comparison(metrics) is None:
-        values, said = _of_calibration(metrics)
-    else:
-        values, said = _of_policy(metrics)
-    return {**values, **_further(metrics)}, said
+    compared = main_comparison(metrics, judge.name)
+    values: dict[str, float] = {}
+    is_calibration = key_of(judge.name, "policy") not in metrics and compared is None
+    words = ["calibration"] if is_calibration else []
+    if compared is not None:
+        words.append(_improvement(metrics, compared, values))
+    errors = {judge.name: (judge.heading, judge.unit), **_ERRORS}
+    baseline = "" if compared is None else compared.baseline
+    for name, (heading, unit) in errors.items():
+        measured = {}
+        for method in ("policy", *_CONSTANT):
+            error = metrics.get(key_of(name, method), math.nan)
+            if math.isfinite(error):
+                measured[method] = error
+        if not measured:
+            continue
+        key = with_unit(name, unit)
+        values[key] = round(next(iter(measured.values())), 3)
+        if name == judge.name:
+            for method, error in measured.items():
+                if method != "policy":
+                    values[with_unit(f"{name}_{method}", unit)] = round(error, 3)
+        words.append(_error_said(f"{heading}", f" {unit}".rstrip(), measured, baseline))
+    for name in _COUNTED:
+        value = metrics.get(key_of(name, judged_method(metrics, judge.name)), math.nan)
+        if math.isfinite(value):
+            values[name] = round(value, 3)
+    return values, "; ".join(words)
+
+
+def judged_method(metrics: Mapping[str, float], judge: str) -> str:
+    """Returns the method that a job is judged by, "" if none was measured."""
+    for method in ("policy", *_CONSTANT):
+        if math.isfinite(metrics.get(key_of(judge, method), math.nan)):
+            return method
+    return ""
+
+
+def _error_said(heading: str, unit: str, measured: Mapping[str, float], baseline: str) -> str:
+    """Returns an error in words: the policy's beside its baseline's, or that of constant sets."""
+    if "policy" in measured:
+        text = f"{heading} {measured['policy']:.3f}{unit}"
+        if baseline in measured:
+            text += f" ({_CONSTANT[baseline]} {measured[baseline]:.3f}{unit})"
+        return text
+    sets = []
+    for method, error in measured.items():
+        sets.append(f"{_CONSTANT[method]} {error:.3f}{unit}")
+    return f"{heading} {', '.join(sets)}"
 
 
 def fitted_errors(errors: Mapping[str, float]) -> dict[str, float]:
     """Returns the headline's errors on the part that was calibrated on.
 
     Args:
-        errors: mean `rmse_speed` (m/s) and `rmse_gap` (m) of driver-specific parameters there.
+        errors: means of driver-specific parameters there, by metric.
     """
-    names = {"rmse_speed": "rmse_speed_fitted_mps", "rmse_gap": "rmse_gap_fitted_m"}
-    found = {}
-    for metric, name in names.items():
+    fitted = {}
+    for metric, (_, unit) in _ERRORS.items():
         if math.isfinite(errors.get(metric, math.nan)):
-            found[name] = round(errors[metric], 3)
-    return found
-
-
-def _further(metrics: Mapping[str, float]) -> dict[str, float]:
-    """Returns the error of each constant set, and what else is first asked of the judged method."""
-    found: dict[str, float] = {}
-    judged = ""
-    for method in ("policy", *_CONSTANT):
-        error = metrics.get(key_of("rmse_speed", method), math.nan)
-        if not math.isfinite(error):
-            continue
-        judged = judged or method
-        if method in _CONSTANT:
-            found[f"rmse_speed_{_CONSTANT[method].replace('-', '_')}_mps"] = round(error, 3)
-    for name, metric in _JUDGED.items():
-        value = metrics.get(key_of(metric, judged), math.nan)
-        if math.isfinite(value):
-            found[name] = round(value, 3)
-    return found
-
-
-def _of_policy(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
-    values: dict[str, float] = {}
-    words = []
-    compared = main_comparison(metrics)
-    if compared is not None:
-        words.append(_improvement(metrics, compared, values))
-    error = metrics.get(key_of("rmse_speed", "policy"), math.nan)
-    if math.isfinite(error):
-        values[SPEED_ERROR] = round(error, 3)
-        said = f"RMSE of speed {error:.3f} m/s"
-        if compared is not None:
-            before = metrics.get(key_of("rmse_speed", compared.baseline), math.nan)
-            if math.isfinite(before):
-                said += f" ({_CONSTANT[compared.baseline]} {before:.3f} m/s)"
-        words.append(said)
-    return values, "; ".join(words)
+            fitted[with_unit(f"{metric}_fitted", unit)] = round(errors[metric], 3)
+    return fitted
 
 
 def _improvement(
@@ -195,15 +235,8 @@ def _improvement(
     text += f" over {_CONSTANT[compared.baseline]}"
     if compared.scope != "test":
         text += " on full trajectories"
-    return ", ".join([text, *doubts(metrics, compared)])
-
-
-def _of_calibration(metrics: Mapping[str, float]) -> tuple[dict[str, float], str]:
-    values: dict[str, float] = {}
-    words = ["calibration"]
-    for method, name in _CONSTANT.items():
-        error = metrics.get(key_of("rmse_speed", method), math.nan)
-        if math.isfinite(error):
-            values.setdefault(SPEED_ERROR, round(error, 3))
-            words.append(f"{name} {error:.3f} m/s")
-    return values, "; ".join(words)
+    known = {}
+    for name in ("geometric", "ratio_of_means", "drivers"):
+        if f"{compared.key}/{name}" in metrics:
+            known[name] = metrics[f"{compared.key}/{name}"]
+    return ", ".join([text, *doubts(known)])

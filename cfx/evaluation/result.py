@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cfx.calibration.identifiability import with_flat_shares
 from cfx.core.parameters import Parameter
 from cfx.evaluation.headline import improvement_key
-from cfx.evaluation.metrics.base import SCOPES, LeftOut, MetricInfo
+from cfx.evaluation.metrics.base import RMSE_SPEED, SCOPES, LeftOut, MetricInfo
 from cfx.evaluation.statistics import Improvement
 from cfx.evaluation.tables import at_places, in_text, summaries, values_of, wide_table
 
@@ -166,8 +166,8 @@ class Evaluation:
             the simulation still comes from the measured state; `full_trajectory/METRIC/METHOD`:
             from the first frame on, where that was simulated. `measured` says what each is, its
             unit, and how the pairs become one number. `METRIC/real`: the recorded drivers'.
-        `improvement/rmse_speed/BASELINE/STATISTIC`: see `Improvement`; `steady/...` and
-            `full_trajectory/...` as above.
+        `improvement/METRIC/BASELINE/STATISTIC`: of the metric `judge`, see `Improvement`;
+            `steady/...` and `full_trajectory/...` as above.
     Further tables bring metrics of their own (`cfx.results.table`).
 
     Attributes:
@@ -177,8 +177,9 @@ class Evaluation:
             on which share of its range the loss is flat, where that was asked.
         values: a row per pair, method, scope and metric; see `cfx.evaluation.tables`.
         measured: the metrics, in the order in which they are shown.
-        improvements: statistics of the policy's improvement, by scope (`test`; `steady`, after the
-            transient, and `full_trajectory`, where there are any) and baseline.
+        judge: name of the metric by which methods are compared: what was minimised.
+        improvements: statistics of the policy's improvement of it, by scope (`test`; `steady`,
+            after the transient, and `full_trajectory`, where there are any) and baseline.
         trajectories: the closed loops themselves, in the order of the pairs; those of a job are
             made when they are asked for.
         parameters: the tuned ones, in the bounds within which the policy chooses.
@@ -202,6 +203,7 @@ class Evaluation:
     improvements: Mapping[str, Mapping[str, Improvement]]
     trajectories: Sequence[PairTrajectory]
     parameters: tuple[Parameter, ...]
+    judge: str = RMSE_SPEED.name
     purpose: Purpose = Purpose.ADAPTATION
     left_out: tuple[LeftOut, ...] = ()
     outside: Mapping[str, str] = field(default_factory=dict)
@@ -222,7 +224,7 @@ class Evaluation:
 
         With forecasts there are also the columns `forecast_METRIC`.
         """
-        table = wide_table(self.about, self.values, self.measured)
+        table = wide_table(self.about, self.values, self.measured, self.judge)
         forecast = self.values[self.values["scope"] == FORECAST]
         columns = {}
         for metric in forecast["metric"].unique():
@@ -258,6 +260,14 @@ class Evaluation:
         return replace(self, about=about, values=values, platoon=platoon)
 
     @property
+    def judge_info(self) -> MetricInfo:
+        """The metric by which methods are compared."""
+        for metric in self.measured:
+            if metric.name == self.judge:
+                return metric
+        return RMSE_SPEED
+
+    @property
     def _policy_repeats(self) -> bool:
         """Whether the policy has the errors of another method, for every pair."""
         speed = values_of(self.values, "rmse_speed", "test")
@@ -276,7 +286,7 @@ class Evaluation:
             if "policy" not in self.methods:
                 continue
             for baseline, improvement in improvements.items():
-                prefix = improvement_key(baseline, scope)
+                prefix = improvement_key(self.judge, baseline, scope)
                 for name, value in improvement.metrics().items():
                     values[f"{prefix}/{name}"] = value
         return values

@@ -32,9 +32,10 @@ def site_table(pairs: PairSet, evaluation: Evaluation) -> pd.DataFrame | None:
     Returns:
         A row per scope (`test`, `full_trajectory`), site and driver type (`all`, and each type
         where a site has several): scope, site, driver_type, pairs, drivers, for each method
-        `rmse_speed_METHOD` (m/s) and `rmse_gap_METHOD` (m), means over pairs; and for each baseline
-        the policy's geometric improvement of the RMSE of speed `over_BASELINE`, its median over
-        drivers `over_BASELINE_median`, and its 95 % interval over drivers, `over_BASELINE_low` and
+        `rmse_speed_METHOD` (m/s) and `rmse_gap_METHOD` (m), means over pairs, and the error by
+        which the job is judged where it is another; and for each baseline the policy's geometric
+        improvement of that error `over_BASELINE`, its median over drivers
+        `over_BASELINE_median`, and its 95 % interval over drivers, `over_BASELINE_low` and
         `over_BASELINE_high`. The site `all` is the mean over sites: see `geometric_over_sites`.
     """
     labels = _labels(pairs, evaluation)
@@ -42,19 +43,21 @@ def site_table(pairs: PairSet, evaluation: Evaluation) -> pd.DataFrame | None:
         return None
     rows = []
     for scope in ("test", "full_trajectory"):
-        speed = values_of(evaluation.values, "rmse_speed", scope)
-        gap = values_of(evaluation.values, "rmse_gap", scope)
-        if "policy" not in speed and scope != "test":
+        errors = {}
+        for metric in dict.fromkeys((evaluation.judge, "rmse_speed", "rmse_gap")):
+            errors[metric] = values_of(evaluation.values, metric, scope)
+        judged = errors[evaluation.judge]
+        if "policy" not in judged and scope != "test":
             continue
-        about = labels.loc[speed.index]
+        about = labels.loc[judged.index]
         for site, of_site in about.groupby("site", sort=False):
-            rows.append(_row(scope, str(site), ALL_SITES, of_site, speed, gap))
+            rows.append(_row(scope, str(site), ALL_SITES, of_site, errors))
             if len(set(of_site["driver_type"])) > 1:
                 for kind, of_kind in of_site.groupby("driver_type", sort=False):
                     name = str(kind) or "not known"
-                    rows.append(_row(scope, str(site), name, of_kind, speed, gap))
+                    rows.append(_row(scope, str(site), name, of_kind, errors))
         every = [row for row in rows if row["scope"] == scope and row["driver_type"] == ALL_SITES]
-        rows.append(_mean_of_sites(scope, every, about, speed))
+        rows.append(_mean_of_sites(scope, every, about, judged))
     return pd.DataFrame(rows)
 
 
@@ -74,10 +77,12 @@ def _row(
     site: str,
     kind: str,
     about: pd.DataFrame,
-    speed: pd.DataFrame,
-    gap: pd.DataFrame,
+    errors: Mapping[str, pd.DataFrame],
 ) -> dict[str, object]:
-    """Returns the row of some pairs of a site, of which `about` has the labels."""
+    """Returns the row of some pairs of a site, of which `about` has the labels.
+
+    The first of `errors` is the one by which the job is judged.
+    """
     row: dict[str, object] = {
         "scope": scope,
         "site": site,
@@ -85,16 +90,17 @@ def _row(
         "pairs": len(about),
         "drivers": about["driver"].nunique(),
     }
-    own_speed, own_gap = speed.loc[about.index], gap.loc[about.index]
+    own = {metric: table.loc[about.index] for metric, table in errors.items()}
+    judged = next(iter(own.values()))
     for method in METHODS:
-        if method in speed:
-            row[f"rmse_speed_{method}"] = float(own_speed[method].mean())
-            row[f"rmse_gap_{method}"] = float(own_gap[method].mean())
+        if method in judged:
+            for metric, table in own.items():
+                row[f"{metric}_{method}"] = float(table[method].mean())
     for baseline in BASELINES:
-        if baseline in speed and "policy" in speed:
+        if baseline in judged and "policy" in judged:
             improvement = improvement_statistics(
-                own_speed[baseline].to_numpy(),
-                own_speed["policy"].to_numpy(),
+                judged[baseline].to_numpy(),
+                judged["policy"].to_numpy(),
                 about["driver"].tolist(),
             )
             low, high = improvement.ci95_low, improvement.ci95_high
@@ -114,7 +120,7 @@ def _mean_of_sites(
     scope: str,
     rows: Sequence[Mapping[str, object]],
     about: pd.DataFrame,
-    speed: pd.DataFrame,
+    judged: pd.DataFrame,
 ) -> dict[str, object]:
     """Returns the row in which each site counts once; `rows` are theirs."""
     table = pd.DataFrame(rows)
@@ -126,13 +132,13 @@ def _mean_of_sites(
         "drivers": int(table["drivers"].sum()),
     }
     for name in table.columns:
-        if name.startswith("rmse_"):
+        if name.endswith(tuple(f"_{method}" for method in METHODS)) and name[:5] != "over_":
             row[name] = float(table[name].mean())
     for baseline in BASELINES:
         if f"over_{baseline}" in table:
             geometric, low, high = geometric_over_sites(
-                speed[baseline].to_numpy(),
-                speed["policy"].to_numpy(),
+                judged[baseline].to_numpy(),
+                judged["policy"].to_numpy(),
                 about["driver"].tolist(),
                 about["site"].tolist(),
             )

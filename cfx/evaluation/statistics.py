@@ -265,18 +265,20 @@ class Ranking(NamedTuple):
 
     Attributes:
         jobs: their names, the smallest mean error first.
+        errors: of each the mean error over these pairs.
         pairs: on how many pairs they are compared.
         against: the best one against each other.
         apart: jobs that were tested on other pairs or other frames, which are not ranked.
     """
 
     jobs: tuple[str, ...]
+    errors: tuple[float, ...]
     pairs: int
     against: tuple[Against, ...]
     apart: tuple[str, ...]
 
 
-def ranking_of(errors: Mapping[str, pd.DataFrame]) -> Ranking:
+def ranking_of(errors: Mapping[str, Sequence[pd.DataFrame]]) -> Ranking:
     """Ranks jobs by their mean error, and compares the best one with each other.
 
     The best is chosen by the errors that then test it, so that the best of many equal jobs would
@@ -286,21 +288,24 @@ def ranking_of(errors: Mapping[str, pd.DataFrame]) -> Ranking:
     5 % of such families.
 
     Args:
-        errors: of each job a row per pair: `pair_id`, `driver`, `frames` (that were simulated) and
-            `error`. Jobs are compared that simulated the same frames of the same pairs; of several
-            such groups the largest counts, of groups of one size the first.
+        errors: of each job, for each of its seeds, a row per pair: `pair_id`, `driver`, `frames`
+            (that were simulated) and `error`. A pair's error is the mean over seeds. Jobs are
+            compared that simulated the same frames of the same pairs; of several such groups the
+            largest counts, of groups of one size the first.
     """
+    tables = {name: _over_seeds(of_seeds) for name, of_seeds in errors.items()}
     groups: dict[frozenset[tuple[object, object]], list[str]] = {}
-    for name, table in errors.items():
+    for name, table in tables.items():
         tested = frozenset(zip(table["pair_id"], table["frames"], strict=True))
         groups.setdefault(tested, []).append(name)
     if not groups:
-        return Ranking((), 0, (), ())
+        return Ranking((), (), 0, (), ())
     tested, names = max(groups.items(), key=lambda group: len(group[1]))
-    columns = {name: errors[name].set_index("pair_id")["error"] for name in names}
-    drivers = errors[names[0]].set_index("pair_id")["driver"].astype(str)
+    columns = {name: tables[name].set_index("pair_id")["error"] for name in names}
+    drivers = tables[names[0]].set_index("pair_id")["driver"].astype(str)
     aligned = {name: column.reindex(drivers.index) for name, column in columns.items()}
-    ranked = sorted(names, key=lambda name: _finite_first(float(aligned[name].mean(skipna=False))))
+    means = {name: float(column.mean(skipna=False)) for name, column in aligned.items()}
+    ranked = sorted(names, key=lambda name: _finite_first(means[name]))
     compared: dict[tuple[str, str], Improvement] = {}
     for better, worse in combinations(ranked, 2):
         before, after = aligned[worse].to_numpy(float), aligned[better].to_numpy(float)
@@ -312,7 +317,18 @@ def ranking_of(errors: Mapping[str, pd.DataFrame]) -> Ranking:
         key = ranked[0], other
         against.append(Against(*key, compared[key], corrected[key]))
     apart = tuple(name for name in errors if name not in ranked)
-    return Ranking(tuple(ranked), len(tested), tuple(against), apart)
+    mean_errors = tuple(means[name] for name in ranked)
+    return Ranking(tuple(ranked), mean_errors, len(tested), tuple(against), apart)
+
+
+def _over_seeds(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:
+    """Returns the mean error of each pair over tables of several seeds."""
+    import pandas as pd
+
+    if len(tables) == 1:
+        return tables[0]
+    together = pd.concat(tables).groupby(["pair_id", "driver", "frames"], sort=False)
+    return together[["error"]].mean().reset_index()
 
 
 def _finite_first(error: float) -> float:

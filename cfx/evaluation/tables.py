@@ -15,7 +15,14 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from cfx.calibration.identifiability import FLAT_SHARE_PREFIX
-from cfx.evaluation.metrics.base import RECORDED, SCOPES, MetricInfo, column_of, key_of
+from cfx.evaluation.metrics.base import (
+    RECORDED,
+    RMSE_SPEED,
+    SCOPES,
+    MetricInfo,
+    column_of,
+    key_of,
+)
 from cfx.simulation.trajectory import TRANSIENT_S
 
 VALUE_COLUMNS = ("pair_id", "driver", "method", "scope", "metric", "value")
@@ -103,12 +110,15 @@ def values_of(values: pd.DataFrame, metric: str, scope: str) -> pd.DataFrame:
 
 
 def wide_table(
-    about: pd.DataFrame, values: pd.DataFrame, metrics: Sequence[MetricInfo]
+    about: pd.DataFrame,
+    values: pd.DataFrame,
+    metrics: Sequence[MetricInfo],
+    judge: str = RMSE_SPEED.name,
 ) -> pd.DataFrame:
     """Returns a row per pair and method: what `about` says, and the metrics as columns.
 
     Columns besides those of `about`: METRIC, `steady_METRIC`, `full_trajectory_METRIC` and, of the
-    recorded driver, `real_METRIC`; `improvement_over_BASELINE`.
+    recorded driver, `real_METRIC`; `improvement_over_BASELINE`, of the metric `judge`.
     """
     parameters = [name for name in about if str(name).startswith(("parameter_", FLAT_SHARE_PREFIX))]
     columns: dict[str, pd.Series] = {}
@@ -120,7 +130,7 @@ def wide_table(
                     column = _whole_numbers(column)
                 columns[column_of(metric.name, scope)] = column
         if scope == "test":
-            columns |= _improvements(about, values)
+            columns |= _improvements(about, values, judge)
     for metric in metrics:
         recorded = values_of(values, metric.name, "test")
         if RECORDED in recorded:
@@ -185,14 +195,14 @@ def _whole_numbers(column: pd.Series) -> pd.Series:
     return column
 
 
-def _improvements(about: pd.DataFrame, values: pd.DataFrame) -> dict[str, pd.Series]:
-    """Returns each method's improvement of the RMSE of speed over each baseline, by column."""
-    speed = values_of(values, "rmse_speed", "test")
-    own = at_places(speed, about)
+def _improvements(about: pd.DataFrame, values: pd.DataFrame, judge: str) -> dict[str, pd.Series]:
+    """Returns each method's improvement of an error over each baseline, by column."""
+    errors = values_of(values, judge, "test")
+    own = at_places(errors, about)
     columns = {}
     for baseline in about["method"].drop_duplicates():
         if baseline == "policy":
             continue
-        before = about["pair_id"].map(speed[baseline])
+        before = about["pair_id"].map(errors[baseline])
         columns[f"improvement_over_{baseline}"] = ((before - own) / before).where(before > 0)
     return dict(sorted(columns.items()))

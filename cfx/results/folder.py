@@ -10,9 +10,9 @@ from pathlib import Path
 import yaml
 
 from cfx.core.files import atomic_write, remove_leftovers
-from cfx.core.job_folder import parse_yaml
+from cfx.core.job_folder import optional, parse_yaml, read_yaml_list
 from cfx.core.storage import RemoteFolder
-from cfx.errors import ConfigError, DataError, OutputError
+from cfx.errors import ConfigError, DataError, OutputError, without_passwords
 from cfx.results.config import JobConfig
 
 log = logging.getLogger(__name__)
@@ -23,6 +23,14 @@ DATA = "data.json"
 
 METRICS = "metrics.json"
 """The file that is written last: a folder that has it is complete."""
+
+
+def typed_overrides(folder: Path) -> tuple[str, ...] | None:
+    """Returns what was typed for a job, without passwords; None if its folder does not say it."""
+    typed = optional(folder / ".hydra" / "overrides.yaml", read_yaml_list)
+    if typed is None:
+        return None
+    return tuple(without_passwords(str(override)) for override in typed)
 
 
 def begin(folder: Path, config: JobConfig) -> None:

@@ -14,11 +14,10 @@ from cfx.core.job_folder import (
     read_json,
     read_metrics,
     read_yaml,
-    read_yaml_list,
 )
-from cfx.errors import DataError, without_passwords
+from cfx.errors import DataError
 from cfx.policies.ready import is_ready_made
-from cfx.results.folder import CONFIG, DATA, METRICS
+from cfx.results.folder import CONFIG, DATA, METRICS, typed_overrides
 from cfx.results.result import Result
 from cfx.results.table import file_of, installed, stored_tables
 from cfx.results.tracker import Origin, folder_of
@@ -53,10 +52,7 @@ def read_result(origin: Origin) -> Result:
         if table.component.always and table.name not in tables:
             missing.append(file_of(table))
     hydra = folder if origin.hydra is None else origin.hydra
-    typed = optional(hydra / ".hydra" / "overrides.yaml", read_yaml_list)
-    overrides = None
-    if typed is not None:
-        overrides = tuple(without_passwords(str(override)) for override in typed)
+    overrides = typed_overrides(hydra)
     started, seconds = _duration(hydra, origin)
     version, commit = str(origin.version or data.get("cfx") or ""), str(data.get("commit") or "")
     if commit:  # of the folder that the job was started in

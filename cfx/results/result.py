@@ -27,7 +27,7 @@ from cfx.data.style import StyleResult
 from cfx.data.tidy import write_tidy
 from cfx.errors import DataError, listed
 from cfx.evaluation.headline import headline, improvement_key
-from cfx.evaluation.metrics.base import SUMMARIES, MetricInfo, column_of, key_of
+from cfx.evaluation.metrics.base import RMSE_SPEED, SUMMARIES, MetricInfo, column_of, key_of
 from cfx.evaluation.result import METHODS, Evaluation, PairTrajectory, Purpose
 from cfx.evaluation.statistics import STATISTICS, Improvement, are_comparable
 from cfx.evaluation.tables import scope_label
@@ -290,6 +290,11 @@ class Result:
                 return method
         return "default"
 
+    @cached_property
+    def judge(self) -> MetricInfo:
+        """The error by which methods, and jobs, are compared: what was minimised."""
+        return judge_of(self.data, self.metrics)
+
     def baselines(self, scope: str = _TEST) -> tuple[str, ...]:
         """Returns what the policy was compared with, driver-specific calibration first.
 
@@ -299,7 +304,9 @@ class Result:
             return ()
         baselines: list[str] = []
         for method in ("driver_specific", *self.methods):
-            was_compared = f"{improvement_key(method, scope)}/geometric" in self.metrics
+            was_compared = (
+                f"{improvement_key(self.judge.name, method, scope)}/geometric" in self.metrics
+            )
             is_new = method not in {*baselines, "policy"}
             if was_compared and is_new and method in self.methods:
                 baselines.append(method)
@@ -341,7 +348,7 @@ class Result:
         return summaries
 
     def improvement(self, over: str = "driver_specific", scope: str = _TEST) -> pd.Series:
-        """Returns the policy's improvement of the RMSE of speed over a baseline (0.1 is 10 %).
+        """Returns the policy's improvement over a baseline (0.1 is 10 %), of the error `judge`.
 
         Args:
             over: the baseline: `driver_specific`, `pooled` or `default`.
@@ -354,11 +361,11 @@ class Result:
         Raises:
             DataError: they were not compared.
         """
-        prefix = improvement_key(over, scope)
+        prefix = improvement_key(self.judge.name, over, scope)
         if f"{prefix}/geometric" not in self.metrics:
             compared = []
             for method in METHODS:
-                if f"{improvement_key(method, scope)}/geometric" in self.metrics:
+                if f"{improvement_key(self.judge.name, method, scope)}/geometric" in self.metrics:
                     compared.append(method)
             raise DataError(
                 f"improvement(over={over!r}, scope={scope!r}): the policy was not compared with it;"
@@ -369,7 +376,7 @@ class Result:
 
     def statistics(self, baseline: str, scope: str = _TEST) -> Improvement:
         """Returns the improvement over a baseline; NaN where a statistic is not known."""
-        prefix = improvement_key(baseline, scope)
+        prefix = improvement_key(self.judge.name, baseline, scope)
         statistics: dict[str, float] = {}
         for name in STATISTICS:
             if name != "drivers":
@@ -382,7 +389,7 @@ class Result:
 
     def _improved_drivers(self, baseline: str, scope: str) -> pd.Series:
         """Returns the drivers of the pairs whose improvement over a baseline is defined."""
-        column = column_of("rmse_speed", scope)
+        column = column_of(self.judge.name, scope)
         if column not in self.pairs:
             return pd.Series(dtype=object)
         rows = self.pairs.drop_duplicates(["pair_id", "method"])
@@ -399,30 +406,32 @@ class Result:
         """Statistics of the policy's improvement on the test part, by baseline."""
         return {baseline: self.statistics(baseline) for baseline in self.baselines()}
 
-    @property
-    def errors(self) -> pd.DataFrame:
-        """A row per pair, by the method that the job is judged by: `pair_id`, `driver`, `frames`.
+    def errors_by(self, metric: str) -> pd.DataFrame:
+        """Returns a row per pair, by the method that the job is judged by.
 
-        `error` is its RMSE of speed on the test part, m/s.
+        Args:
+            metric: name of the error, such as that of `judge`.
+
+        Returns:
+            `pair_id`, `driver`, `frames` that count, and `error` on the test part, in its unit.
         """
         rows = self.pairs[self.pairs["method"] == self.judged]
-        return rows[["pair_id", "driver", "frames", "rmse_speed"]].rename(
-            columns={"rmse_speed": "error"}
-        )
+        columns = ["pair_id", "driver", "frames", metric]
+        return rows[columns].rename(columns={metric: "error"})
 
     @cached_property
     def by_pair(self) -> pd.DataFrame:
         """A row per pair.
 
-        Columns: pair_id, driver, cluster, style_score, `rmse_speed/METHOD`, `rmse_gap/METHOD`,
-        `improvement/BASELINE`.
+        Columns: pair_id, driver, cluster, style_score, `rmse_speed/METHOD`, `rmse_gap/METHOD`, the
+        error by which the job is judged where it is another, and its `improvement/BASELINE`.
         """
         first = self.pairs.drop_duplicates("pair_id").set_index("pair_id")
         table = first.filter(items=["driver", "cluster", "style_score"])
         for method in self.methods:
             rows = self.pairs[self.pairs["method"] == method]
             of_method = rows.drop_duplicates("pair_id").set_index("pair_id")
-            for column in ("rmse_speed", "rmse_gap"):
+            for column in dict.fromkeys((self.judge.name, "rmse_speed", "rmse_gap")):
                 table[f"{column}/{method}"] = of_method[column]
         rows = self.pairs[self.pairs["method"] == "policy"]
         of_policy = rows.drop_duplicates("pair_id").set_index("pair_id")
@@ -531,7 +540,7 @@ class Result:
         chosen = [f"model={model}", f"policy={policy}"]
         if len(self.pairs):
             chosen.append(f"{self.pairs['pair_id'].nunique()} pairs")
-        _, words = headline(self.metrics)
+        _, words = headline(self.metrics, self.judge)
         if words:
             chosen.append(words)
         folder = "not saved" if self.folder is None else f"folder={str(self.folder)!r}"
@@ -541,7 +550,8 @@ class Result:
         rows = {}
         for method in self.methods:
             of_method = self.pairs[self.pairs["method"] == method]
-            rows[method] = of_method[["rmse_speed", "rmse_gap"]].mean()
+            columns = list(dict.fromkeys((self.judge.name, "rmse_speed", "rmse_gap")))
+            rows[method] = of_method[columns].mean()
         return as_html(repr(self), pd.DataFrame(rows).T.rename_axis("mean over pairs"))
 
 
@@ -575,6 +585,7 @@ def description_of(evaluation: Evaluation) -> dict[str, Any]:
     return {
         "parameters": described_parameters(evaluation.parameters),
         "purpose": evaluation.purpose,
+        "judge": evaluation.judge,
         "transient_s": TRANSIENT_S,
         "style": described_style,
         "metrics": [metric.to_json() for metric in evaluation.measured],
@@ -601,6 +612,14 @@ def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tupl
             if scopes and metric.summary in SUMMARIES:
                 known.append(replace(metric, scopes=tuple(scopes)))
     return tuple(known)
+
+
+def judge_of(data: Mapping[str, Any], metrics: Mapping[str, float]) -> MetricInfo:
+    """Returns the error by which a job is judged, from its `data.json` and `metrics.json`."""
+    for metric in known_metrics(data, metrics):
+        if metric.name == data.get("judge"):
+            return metric
+    return RMSE_SPEED
 
 
 def _number(value: object) -> float | None:

@@ -27,10 +27,12 @@ from cfx.calibration.settings import (
 )
 from cfx.core.parameters import Parameter
 from cfx.data.style import INDICATORS, style_distances, styles_by_site
+from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.sites import ALL_SITES, BASELINES
 from cfx.evaluation.statistics import improvement_statistics
 from cfx.evaluation.tables import scope_label
+from cfx.figures.wording import short_label
 from cfx.learners.curves import best_losses
 from cfx.policies.context import LEVEL as EXPECTED_LEVEL
 from cfx.results.table import Column, ResultTable
@@ -64,7 +66,7 @@ class Pairs(ResultTable):
         Column("rmse_gap", "m", "RMSE of the gap on the test part"),
         Column("collisions", "1", "1 if the gap became negative", "int"),
         Column("METRIC", "as of the metric", "another metric of the test part"),
-        Column("improvement_over_METHOD", "1", "improvement of the RMSE of speed over a method"),
+        Column("improvement_over_METHOD", "1", "improvement over a method, of the job's error"),
         Column("steady_METRIC", "as of the metric", "a metric after the transient"),
         Column("full_trajectory_METRIC", "as of the metric", "a metric of the full trajectory"),
         Column("real_METRIC", "as of the metric", "a metric of the recorded driver"),
@@ -465,7 +467,10 @@ class Sites(ResultTable):
         Column("drivers", "1", "their drivers", "int"),
         Column("rmse_speed_METHOD", "m/s", "RMSE of speed, mean over pairs"),
         Column("rmse_gap_METHOD", "m", "RMSE of the gap, mean over pairs"),
-        Column("over_BASELINE", "1", "the policy's improvement of the RMSE of speed, mean"),
+        Column(
+            "METRIC_METHOD", "as of the metric", "the error that was minimised, mean over pairs"
+        ),
+        Column("over_BASELINE", "1", "the policy's improvement of that error, geometric"),
         Column("over_BASELINE_median", "1", "its median over pairs"),
         Column("over_BASELINE_low", "1", "lower end of the mean's 95 % interval over drivers"),
         Column("over_BASELINE_high", "1", "its upper end"),
@@ -474,10 +479,10 @@ class Sites(ResultTable):
     def metrics(self, evaluation: Evaluation) -> Mapping[str, float]:
         columns = {}
         for method in METHODS:
-            for metric in ("rmse_speed", "rmse_gap"):
+            for metric in (evaluation.judge, "rmse_speed", "rmse_gap"):
                 columns[f"{metric}_{method}"] = f"{metric}/{method}"
         for baseline in BASELINES:
-            columns[f"over_{baseline}"] = f"improvement/rmse_speed/{baseline}"
+            columns[f"over_{baseline}"] = f"improvement/{evaluation.judge}/{baseline}"
         found: dict[str, float] = {}
         table = evaluation.tables["sites"]
         for _, row in table[table["driver_type"] == ALL_SITES].iterrows():
@@ -489,28 +494,26 @@ class Sites(ResultTable):
 
     def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[Table]:
         for scope, rows in evaluation.tables["sites"].groupby("scope", sort=False):
-            yield _sites_printed(rows, scope_label(str(scope)))
+            yield _sites_printed(rows, scope_label(str(scope)), evaluation.judge_info)
 
 
-def _sites_printed(rows: pd.DataFrame, scope: str) -> Table:
-    """Returns RMSE of speed by site and method, and the policy's improvement with its interval."""
-    table = Table(
-        title=f"By site, {scope}: RMSE of speed, m/s; improvement, %", title_justify="left"
-    )
+def _sites_printed(rows: pd.DataFrame, scope: str, judge: MetricInfo) -> Table:
+    """Returns the error by site and method, and the policy's improvement with its interval."""
+    table = Table(title=f"By site, {scope}: {judge.title}; improvement, %", title_justify="left")
     table.add_column("site")
     table.add_column("drivers", justify="right")
     known = set(rows.dropna(axis=1, how="all"))
-    methods = [one for one in METHODS if f"rmse_speed_{one}" in known and one != "shrunk"]
+    methods = [one for one in METHODS if f"{judge.name}_{one}" in known and one != "shrunk"]
     for method in methods:
-        table.add_column(method, justify="right")
+        table.add_column(short_label(method), justify="right")
     baselines = [one for one in BASELINES if f"over_{one}" in known]
     for baseline in baselines:
-        table.add_column(f"over {baseline}", justify="right")
+        table.add_column(f"over {short_label(baseline)}", justify="right")
     for _, row in rows.iterrows():
         name = escape(str(row["site"]))
         if row["driver_type"] != ALL_SITES:
             name = f"  {escape(str(row['driver_type']))}"
-        cells = [f"{row[f'rmse_speed_{method}']:.3f}" for method in methods]
+        cells = [f"{row[f'{judge.name}_{method}']:.3f}" for method in methods]
         for baseline in baselines:
             value, low, high = (row[f"over_{baseline}{end}"] for end in ("", "_low", "_high"))
             cell = f"{100 * value:+.1f}"

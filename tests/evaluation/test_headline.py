@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 from cfx.evaluation.headline import fitted_errors, headline, main_error
+from cfx.evaluation.metrics.base import RMSE_SPEED
 
 METRICS = {
     "improvement/rmse_speed/driver_specific/geometric": 0.21584,
@@ -65,14 +67,32 @@ def test_a_baseline_whose_error_is_not_known_has_no_error_in_the_words() -> None
 def test_a_calibration_is_known_by_the_drivers_own_parameters() -> None:
     metrics = {"rmse_speed/driver_specific": 0.7351, "rmse_speed/pooled": 0.6861}
     values, words = headline(metrics)
-    assert words == "calibration; driver-specific 0.735 m/s; pooled 0.686 m/s"
+    assert words == "calibration; RMSE of speed driver-specific 0.735 m/s, pooled 0.686 m/s"
     assert values == {
         "rmse_speed_mps": 0.735,
         "rmse_speed_driver_specific_mps": 0.735,
         "rmse_speed_pooled_mps": 0.686,
     }
-    assert main_error(metrics) == 0.7351
-    assert main_error(METRICS) == 0.58432
+    assert main_error(metrics, "rmse_speed") == 0.7351
+    assert main_error(METRICS, "rmse_speed") == 0.58432
+
+
+def test_the_error_that_was_minimised_comes_first() -> None:
+    judge = replace(RMSE_SPEED, name="rmse_gap", unit="m", heading="RMSE of gap")
+    metrics = {
+        "improvement/rmse_gap/driver_specific/geometric": 0.25,
+        "rmse_gap/policy": 3.3,
+        "rmse_gap/driver_specific": 5.2,
+        **METRICS,
+    }
+    values, words = headline(metrics, judge)
+    assert words == (
+        "+25.0 % over driver-specific; RMSE of gap 3.300 m (driver-specific 5.200 m);"
+        " RMSE of speed 0.584 m/s (driver-specific 0.735 m/s)"
+    )
+    assert list(values)[:2] == ["improvement_percent", "rmse_gap_m"]
+    assert values["rmse_gap_driver_specific_m"] == 5.2
+    assert main_error(metrics, "rmse_gap") == 3.3
 
 
 def test_what_is_asked_first_of_the_judged_method_has_no_group() -> None:

@@ -129,14 +129,13 @@ def test_each_site_counts_once_however_many_drivers_it_has() -> None:
     assert math.isnan(alone[1])
 
 
-def jobs(*logarithms: np.ndarray) -> dict[str, pd.DataFrame]:
-    """Returns jobs whose errors are 1 m/s times the exponential of these, a pair per driver."""
+def jobs(*logarithms: np.ndarray) -> dict[str, list[pd.DataFrame]]:
+    """Returns jobs of one seed whose errors are the exponential of these, a pair per driver."""
     tables = {}
     for number, values in enumerate(logarithms):
         ids = [f"p{k}" for k in range(len(values))]
-        tables[f"job {number}"] = pd.DataFrame(
-            {"pair_id": ids, "driver": ids, "frames": 100, "error": np.exp(values)}
-        )
+        table = {"pair_id": ids, "driver": ids, "frames": 100, "error": np.exp(values)}
+        tables[f"job {number}"] = [pd.DataFrame(table)]
     return tables
 
 
@@ -157,12 +156,22 @@ def test_of_equal_jobs_none_is_called_significantly_closer() -> None:
 def test_jobs_on_other_pairs_are_not_ranked() -> None:
     rng = np.random.default_rng(6)
     tables = jobs(*rng.normal(0.0, 0.1, (3, 12)))
-    tables["elsewhere"] = tables["job 0"].assign(frames=50, error=0.001)
+    tables["elsewhere"] = [tables["job 0"][0].assign(frames=50, error=0.001)]
     ranking = ranking_of(tables)
     assert set(ranking.jobs) == {"job 0", "job 1", "job 2"}
     assert ranking.apart == ("elsewhere",)
     assert "1 job tested on other pairs or frames is not ranked" in verdict(ranking)
     assert verdict(ranking_of({"alone": tables["job 0"]})) == ""
+
+
+def test_a_job_of_several_seeds_is_ranked_by_its_mean_error() -> None:
+    """A single seed that was lucky comes before no job that is better on average."""
+    lucky, unlucky, steady = np.full(6, math.log(0.1)), np.zeros(6), np.full(6, math.log(0.5))
+    tables = jobs(lucky, unlucky, steady)
+    seeds = {"two seeds": [*tables["job 0"], *tables["job 1"]], "one": tables["job 2"]}
+    ranking = ranking_of(seeds)
+    assert ranking.jobs == ("one", "two seeds")
+    assert ranking.errors == pytest.approx((0.5, 0.55))
 
 
 def test_mean_errors_that_say_the_opposite_are_told() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import sys
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -40,7 +41,7 @@ def report(result: Result, console: Console, *, verbose: bool = False) -> None:
     compared = _comparisons(evaluation)
     adapts = evaluation.purpose is Purpose.ADAPTATION and bool(compared)
     if verbose and adapts:
-        console.print(_improvements_table(compared))
+        console.print(_improvements_table(result.judge.heading, compared))
     sentences = [_in_short(result)]
     if adapts:
         sentences += _undefined(compared)
@@ -68,7 +69,7 @@ def _in_short(result: Result) -> str:
             "With constant parameters the model follows no leader: compare the policy's RMSE with"
             " other jobs'."
         )
-    _, words = headline(result.metrics)
+    _, words = headline(result.metrics, result.judge)
     return f"In short: {words}." if words else ""
 
 
@@ -129,8 +130,8 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
     fitted = _fitted(evaluation) if scope == "test" else pd.DataFrame()
     for metric in shown:
         unit = f"\n[{metric.unit}]" if metric.unit else ""
-        # A word a line: the table fits 80 columns, and no heading is cut.
-        heading = metric.heading.replace(" ", "\n")
+        # About a word a line: the table fits 80 columns, and no heading is cut.
+        heading = re.sub(r"(?<!of) ", "\n", metric.heading)
         table.add_column(escape(f"{heading}{unit}"), justify="right")
         if metric.name in fitted:
             table.add_column("where\nfitted", justify="right")
@@ -233,12 +234,12 @@ def _comparisons(evaluation: Evaluation) -> dict[str, Improvement]:
     return compared
 
 
-def _improvements_table(compared: Mapping[str, Improvement]) -> Table:
+def _improvements_table(error: str, compared: Mapping[str, Improvement]) -> Table:
     """Returns a row per baseline: improvement, interval, that of the means, and who is better off.
 
     It fits 80 columns. The other statistics are in `metrics.json` and in the report.
     """
-    title = "Improvement of the policy over other methods, RMSE of speed, %"
+    title = f"Improvement of the policy over other methods, {error}, %"
     table = Table(title=title, title_justify="left")
     table.add_column("over")
     for column in ("geo-\nmetric", "95 % interval", "mean\nerrors", "better for", "p"):
@@ -306,7 +307,7 @@ def described(result: Result) -> str:
             continue
         chosen.append(f"{group} **{result.setting(f'{group}.name')}**")
     drivers = len(set(pairs.drivers))
-    _, words = headline(result.metrics)
+    _, words = headline(result.metrics, result.judge)
     source = Path(pairs.source).name
     lines = [
         f"{words[:1].upper()}{words[1:]}.",

@@ -36,6 +36,7 @@ from cfx.data.style import StyleResult, measure_style, select_cluster
 from cfx.errors import ConfigError, PluginError
 from cfx.evaluation.demo import Demo
 from cfx.evaluation.metrics.base import MetricSet
+from cfx.evaluation.metrics.objective import judged_by
 from cfx.evaluation.protocols.base import Protocol, ProtocolContext, ProtocolResult
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.sites import site_table
@@ -165,6 +166,7 @@ class JobComponents:
         plugins = distributions(config.model_dump())
         registry.chosen("table", config.tables, plugins)
         registry.chosen("figure", config.figures, plugins)
+        objective = cast(Objective, registry.create("objective", config.objective))
         demo = None
         if config.demo is not None:
             demo = cast(Demo, registry.create("demo", config.demo))
@@ -173,11 +175,11 @@ class JobComponents:
             model=model,
             simulator=simulator,
             optimizer=cast(Optimizer, registry.create("optimizer", config.optimizer)),
-            objective=cast(Objective, registry.create("objective", config.objective)),
+            objective=objective,
             policy=policy,
             learner=learner,
             protocol=protocol,
-            metrics=MetricSet.of(config.metrics),
+            metrics=judged_by(MetricSet.of(config.metrics), objective),
             engine=cast(Engine, registry.create("engine", config.engine)),
             demo=demo,
         )
@@ -415,7 +417,7 @@ def description(
         "pairs": len(pairs),
         "protocol": dict(delivered.notes),
         "dropped": dropped,
-        "objective": {"name": config.objective["name"], "unit": components.objective.unit},
+        "objective": {**config.objective, "unit": components.objective.unit},
         "cfx": version(),
         "commit": commit(Path.cwd()),
     }

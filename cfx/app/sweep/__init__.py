@@ -34,7 +34,6 @@ from omegaconf import DictConfig, OmegaConf, open_dict, read_write
 from omegaconf.errors import OmegaConfBaseException
 
 from cfx.app.hydra_source import resolving
-from cfx.app.sweep import summary
 from cfx.app.sweep.folder import LOCK, RECORD, JobStatus, Record, command_of, find_folder
 from cfx.core.console import print_table
 
@@ -114,15 +113,14 @@ class Sweep:
 
     def _finish(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
         """Writes and prints the summary, and says how to go on; returns the exit code."""
-        from cfx.evaluation.statistics import ranking_of, verdict  # imports NumPy
+        from cfx.app.sweep.summary import SUMMARY, SweepSummary  # imports NumPy
 
         lines = self._close_runs()
-        table = summary.rows(statuses)
-        summary.write_summary(self.folder / summary.SUMMARY, table)
-        print_table(summary.summary_table(table, summary.metric_columns(list(statuses))))
-        said = verdict(ranking_of(summary.errors_of(statuses)))
-        if said:
-            print(said)
+        found = SweepSummary.of(statuses)
+        found.write(self.folder / SUMMARY)
+        print_table(found.table())
+        for sentence in found.sentences():
+            print(sentence)
         code = self._count(statuses, code)
         if any(status.code == 0 for status in statuses.values()):
             for line in lines:

@@ -16,7 +16,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from filelock import BaseFileLock, Timeout
 from hydra.core.global_hydra import GlobalHydra
@@ -27,6 +27,9 @@ from cfx.core.component import content_key
 from cfx.core.files import lock_for, write_json
 from cfx.core.storage import is_url, state
 from cfx.errors import CfxError, ConfigError, DataError
+
+if TYPE_CHECKING:
+    from cfx.evaluation.metrics.base import MetricInfo
 
 log = logging.getLogger(__name__)
 
@@ -109,6 +112,18 @@ def metrics_of(folder: Path) -> dict[str, float]:
     except DataError:
         return {}
     return {name: value for name, value in found.items() if math.isfinite(value)}
+
+
+def judge_of_folder(folder: Path) -> MetricInfo:
+    """Returns the error by which a finished job is judged."""
+    from cfx.core.job_folder import read_json
+    from cfx.results.result import judge_of
+
+    try:
+        data = read_json(folder / "data.json")
+    except DataError:
+        data = {}
+    return judge_of(data, metrics_of(folder))
 
 
 @dataclass(frozen=True)

@@ -1,216 +1,267 @@
-"""The table of a sweep: a row per job, by what differs between the jobs."""
+"""The table of a sweep: a row per job, the smallest error first, by what differs between them."""
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from cfx.app.sweep.folder import JobStatus, metrics_of
 from cfx.core.console import blank_table
 from cfx.core.files import atomic_write
+from cfx.core.job_folder import read_json
 from cfx.errors import DataError
-from cfx.evaluation.headline import main_comparison, summaries_disagree
+from cfx.evaluation.headline import doubts, judged_method, main_comparison
+from cfx.evaluation.metrics.base import MetricInfo, key_of
+from cfx.evaluation.statistics import Ranking, ranking_of
 from cfx.figures.wording import short_label
+from cfx.results.comparison import Comparison, common_judge, objective_of
+from cfx.results.result import judge_of, known_metrics
 
 if TYPE_CHECKING:
     import pandas as pd
     from rich.table import Table
 
-    from cfx.evaluation.metrics.base import MetricInfo
-
 SUMMARY = "summary.csv"
 """Says in a sweep's folder what came of it."""
 
 _STATISTICS = ("geometric", "ci95_low", "ci95_high", "ratio_of_means", "drivers")
-_COMPARED = ["pair_id", "driver", "frames", "method", "rmse_speed"]
-_METHODS = ("default", "driver_specific", "pooled", "policy")
-_SHOWN = ("default", "pooled", "driver_specific", "policy")
-_OVER = "improvement_over"
-_AFTER_OVERRIDES = (_OVER, "rmse_speed_default")
-"""The columns behind the overrides: the second, where no job has a policy."""
+_CONSTANT = ("default", "pooled", "driver_specific")
 
 
-def metric_columns(folders: Sequence[Path]) -> list[MetricInfo]:
-    """Returns the metrics that any of these jobs has measured, besides the RMSE of speed."""
-    from cfx.core.job_folder import optional, read_json, read_metrics
-    from cfx.results.result import known_metrics
+@dataclass(frozen=True)
+class SweptJob:
+    """A job of a sweep, as its folder tells.
 
-    found: dict[str, MetricInfo] = {}
-    for folder in folders:
-        with suppress(DataError):  # a job that failed, or whose files are damaged, adds none
-            data = optional(folder / "data.json", read_json) or {}
-            metrics = optional(folder / "metrics.json", read_metrics) or {}
-            for one in known_metrics(data, metrics):
-                if one.name != "rmse_speed":
-                    found.setdefault(one.name, one)
-    return list(found.values())
-
-
-def rows(statuses: Mapping[Path, JobStatus]) -> list[dict[str, Any]]:
-    """Returns a row per job of the summary.
-
-    Columns: folder, the overrides that differ, the improvement, the RMSE of speed, other metrics of
-        the policy, seconds and state. Where all jobs are calibrations, the improvement is left out,
-        and the other metrics are those of driver-specific parameters.
+    Attributes:
+        folder: of the job.
+        status: how it ended.
+        data: its `data.json`; {} if it failed or left none.
+        metrics: its finite metrics; {} likewise.
     """
-    given = [_as_mapping(status.overrides) for status in statuses.values()]
-    differing = _differing(given)
-    columns = metric_columns(list(statuses))
-    measured = []
-    for folder, status in statuses.items():
-        measured.append({} if status.code else metrics_of(folder))
-    adapts = any("rmse_speed/policy" in found for found in measured)
-    are_calibrations = not adapts and any(
-        "rmse_speed/driver_specific" in found for found in measured
-    )
-    judged = "driver_specific" if are_calibrations else "policy"
-    table = []
-    for (folder, status), own, found in zip(statuses.items(), given, measured, strict=True):
-        row: dict[str, Any] = {"folder": folder.name}
-        for key in differing:
-            row[key] = own.get(key, "")
-        if judged == "policy":
-            row |= _improvement(found)
-        for method in _METHODS:
-            if method != "policy" or judged == "policy":
-                row[f"rmse_speed_{method}"] = found.get(f"rmse_speed/{method}")
-        for column in columns:
-            row[f"{column.name}_{judged}"] = found.get(f"{column.name}/{judged}")
-        row["seconds"] = round(status.seconds, 1)
-        row["state"] = status.state
-        row["message"] = status.message
-        table.append(row)
-    return table
 
+    folder: Path
+    status: JobStatus
+    data: Mapping[str, Any]
+    metrics: Mapping[str, float]
 
-def errors_of(statuses: Mapping[Path, JobStatus]) -> dict[str, pd.DataFrame]:
-    """Returns the errors of each job's pairs, by what differs between the jobs.
+    @classmethod
+    def read(cls, folder: Path, status: JobStatus) -> SweptJob:
+        """Reads what a job left; damaged files are as if they were not there."""
+        data: Mapping[str, Any] = {}
+        if status.code:
+            return cls(folder, status, data, {})
+        with suppress(DataError):
+            data = read_json(folder / "data.json")
+        return cls(folder, status, data, metrics_of(folder))
 
-    Those of jobs that differ in the seed alone are averaged. Of a job with a policy they are the
-    policy's, of a calibration those of driver-specific parameters.
+    @cached_property
+    def overrides(self) -> dict[str, str]:
+        """What was typed, by key."""
+        overrides = {}
+        for override in self.status.overrides:
+            key, _, value = override.partition("=")
+            overrides[key] = value
+        return overrides
 
-    Returns:
-        A row per pair: `pair_id`, `driver`, `frames` and `error` (RMSE of speed, m/s).
-    """
-    import pandas as pd
+    @property
+    def judge(self) -> MetricInfo:
+        """The error by which it is judged."""
+        return judge_of(self.data, self.metrics)
 
-    done = {folder: status for folder, status in statuses.items() if not status.code}
-    given = [_as_mapping(status.overrides) for status in done.values()]
-    differing = [key for key in _differing(given) if key != "seed"]
-    alike: dict[str, list[pd.DataFrame]] = {}
-    for folder, own in zip(done, given, strict=True):
-        name = " ".join(f"{key}={own.get(key, '')}" for key in differing)
+    def pairs(self, judge: str) -> pd.DataFrame | None:
+        """Returns `pair_id`, `driver`, `frames` and `error` of each pair; None: they are gone."""
+        import pandas as pd
+
+        method = judged_method(self.metrics, judge)
+        columns = ["pair_id", "driver", "frames", "method", judge]
         with suppress(OSError, ValueError):  # a job's files may have gone, or be damaged
-            table = pd.read_csv(folder / "pairs.csv", usecols=_COMPARED)
-            own_method = "policy" if (table["method"] == "policy").any() else "driver_specific"
-            rows_of_it = table[table["method"] == own_method]
-            alike.setdefault(name, []).append(rows_of_it.rename(columns={"rmse_speed": "error"}))
-    found = {}
-    for name, tables in alike.items():
-        together = pd.concat(tables).groupby(["pair_id", "driver", "frames"])
-        found[name] = together[["error"]].mean().reset_index()
-    return found
+            table = pd.read_csv(self.folder / "pairs.csv", usecols=columns)
+            return table[table["method"] == method].rename(columns={judge: "error"})
+        return None
 
 
-def write_summary(path: Path, table: Sequence[Mapping[str, Any]]) -> None:
-    """Writes `rows` as CSV; a cell without a value is empty."""
-    with atomic_write(path) as temporary, temporary.open("w", encoding="utf-8", newline="") as file:
-        writer = csv.DictWriter(file, list(table[0]))
-        writer.writeheader()
-        writer.writerows(table)
+@dataclass(frozen=True)
+class SweepSummary:
+    """What came of a sweep.
 
-
-def summary_table(table: Sequence[Mapping[str, Any]], columns: Sequence[MetricInfo] = ()) -> Table:
-    """Returns `rows` as a rich table.
-
-    Args:
-        columns: what else than the RMSE of speed was measured; those that are headlines are shown.
+    Attributes:
+        jobs: of the sweep, in the order in which they were started.
     """
-    first = list(table[0])
-    end = next(first.index(name) for name in _AFTER_OVERRIDES if name in first)
-    overrides = first[1:end]
-    adapts = _OVER in first
-    over = {row[_OVER] for row in table if adapts} - {""}
-    methods = [
-        one for one in _SHOWN if any(row.get(f"rmse_speed_{one}") is not None for row in table)
-    ]
-    judged = "policy" if adapts else "driver_specific"
-    headlines = [column for column in columns if column.headline]
-    shown = blank_table(*(overrides or ["job"]), title="The sweep")
-    if adapts:
-        heading = "improvement"
-        if len(over) == 1:
-            heading = f"improvement over {_in_words(min(over))}"
-        shown.add_column(f"{heading}\n(95 % interval)", justify="right")
-    for method in methods:
-        shown.add_column(f"RMSE speed [m/s]\n{short_label(method)}", justify="right")
-    for column in headlines:
-        title = f"{column.heading} [{column.unit}]" if column.unit else column.heading
-        shown.add_column(f"{title}\n{short_label(judged)}", justify="right")
-    shown.add_column("time [s]", justify="right")
-    shown.add_column("state")
-    for row in table:
-        cells = [str(row[key]) for key in overrides] or [row["folder"]]
-        if adapts:
-            cells.append(_improvement_said(row, named=len(over) > 1))
-        for method in methods:
-            cells.append(_number(row[f"rmse_speed_{method}"]))
-        for column in headlines:
-            cells.append(_number(row[f"{column.name}_{judged}"]))
-        shown.add_row(*cells, f"{row['seconds']:.1f}", row["state"])
-    return shown
 
+    jobs: tuple[SweptJob, ...]
 
-def _in_words(over: str) -> str:
-    """Returns how a baseline is named, with the part of trajectories behind it."""
-    baseline, comma, part = over.partition(",")
-    return f"{short_label(baseline)}{comma}{part}"
+    @classmethod
+    def of(cls, statuses: Mapping[Path, JobStatus]) -> SweepSummary:
+        """Reads the jobs of a sweep."""
+        return cls(tuple(SweptJob.read(*item) for item in statuses.items()))
 
+    @cached_property
+    def judge(self) -> MetricInfo:
+        """The error by which jobs are compared: what all minimised, else the RMSE of speed."""
+        return common_judge(self._objectives)
 
-def _as_mapping(overrides: Sequence[str]) -> dict[str, str]:
-    return {key: value for key, _, value in (one.partition("=") for one in overrides)}
+    @property
+    def _objectives(self) -> list[tuple[MetricInfo, str]]:
+        """What each job that ended well minimised."""
+        objectives = []
+        for job in self.jobs:
+            if job.metrics:
+                objectives.append((job.judge, objective_of(job.judge, job.data)))
+        return objectives
 
+    @cached_property
+    def differing(self) -> list[str]:
+        """The keys in which the jobs differ; all if they differ in none."""
+        keys = dict.fromkeys(key for job in self.jobs for key in job.overrides)
+        differing = []
+        for key in keys:
+            if len({job.overrides.get(key) for job in self.jobs}) > 1:
+                differing.append(key)
+        return differing or list(keys)
 
-def _differing(given: Sequence[Mapping[str, str]]) -> list[str]:
-    """Returns the keys in which the jobs differ; all if they differ in none."""
-    keys = dict.fromkeys(key for one in given for key in one)
-    return [key for key in keys if len({one.get(key) for one in given}) > 1] or list(keys)
+    @cached_property
+    def ranking(self) -> Ranking:
+        """Jobs by the error of the method that each is judged by, on the same held-out pairs.
 
+        Those that differ in the seed alone are one: their errors are averaged.
+        """
+        errors: dict[str, list[pd.DataFrame]] = {}
+        for job in self.jobs:
+            table = job.pairs(self.judge.name) if job.metrics else None
+            if table is not None:
+                errors.setdefault(self._name(job), []).append(table)
+        return ranking_of(errors)
 
-def _improvement(found: Mapping[str, float]) -> dict[str, Any]:
-    """Returns the improvement over the baseline that counts, None where it was not measured."""
-    compared = main_comparison(found)
-    row: dict[str, Any] = {_OVER: ""}
-    row |= dict.fromkeys(f"improvement_{name}" for name in _STATISTICS)
-    if compared is None:
+    def _name(self, job: SweptJob) -> str:
+        """Returns what differs between jobs, besides the seed."""
+        parts = []
+        for key in self.differing:
+            if key != "seed":
+                parts.append(f"{key}={job.overrides.get(key, '')}")
+        return " ".join(parts)
+
+    @cached_property
+    def metrics(self) -> list[MetricInfo]:
+        """What else than the error `judge` any of the jobs has measured."""
+        found: dict[str, MetricInfo] = {}
+        for job in self.jobs:
+            for metric in known_metrics(job.data, job.metrics):
+                if metric.name not in {self.judge.name, "objective"}:
+                    found.setdefault(metric.name, metric)
+        return list(found.values())
+
+    @cached_property
+    def rows(self) -> list[dict[str, Any]]:
+        """A row per job: those that are ranked first, the smallest error first.
+
+        Columns: folder; the overrides that differ; rank; method, by which the job is judged, and
+            its error on the test part, `error_METRIC`; the same of constant parameters,
+            `METRIC_METHOD`; other metrics of that method; the improvement over the baseline that
+            counts; seconds, state and message.
+        """
+        places = {name: place for place, name in enumerate(self.ranking.jobs, start=1)}
+        rows = []
+        for job in self.jobs:
+            rows.append(self._row(job, places.get(self._name(job)) if job.metrics else None))
+        for name in ("over", *_STATISTICS):
+            if not any(row[f"improvement_{name}"] for row in rows):  # they are calibrations
+                for row in rows:
+                    del row[f"improvement_{name}"]
+        return sorted(rows, key=lambda row: row["rank"] or math.inf)
+
+    def _row(self, job: SweptJob, rank: int | None) -> dict[str, Any]:
+        judge, metrics = self.judge.name, job.metrics
+        method = judged_method(metrics, judge)
+        row: dict[str, Any] = {"folder": job.folder.name}
+        for key in self.differing:
+            row[key] = job.overrides.get(key, "")
+        row["rank"], row["method"] = rank, method
+        row[f"error_{judge}"] = metrics.get(key_of(judge, method))
+        for constant in _CONSTANT:
+            row[f"{judge}_{constant}"] = metrics.get(key_of(judge, constant))
+        for metric in self.metrics:
+            row[metric.name] = metrics.get(key_of(metric.name, method))
+        compared = main_comparison(metrics, judge)
+        row["improvement_over"] = ""
+        if compared is not None:
+            part = "" if compared.scope == "test" else ", full"
+            row["improvement_over"] = f"{compared.baseline}{part}"
+        for name in _STATISTICS:
+            value = None if compared is None else metrics.get(f"{compared.key}/{name}")
+            row[f"improvement_{name}"] = value
+        row["seconds"] = round(job.status.seconds, 1)
+        row["state"], row["message"] = job.status.state, job.status.message
         return row
-    row[_OVER] = compared.baseline
-    if compared.scope != "test":
-        row[_OVER] += ", full"
-    for name in _STATISTICS:
-        row[f"improvement_{name}"] = found.get(f"{compared.key}/{name}")
-    return row
 
+    def write(self, path: Path) -> None:
+        """Writes `rows` as CSV; a cell without a value is empty."""
+        with (
+            atomic_write(path) as temporary,
+            temporary.open("w", encoding="utf-8", newline="") as file,
+        ):
+            writer = csv.DictWriter(file, list(self.rows[0]))
+            writer.writeheader()
+            writer.writerows(self.rows)
 
-def _improvement_said(row: Mapping[str, Any], *, named: bool) -> str:
-    """Returns the improvement in words; `named`: with its baseline."""
-    geometric = row["improvement_geometric"]
-    if geometric is None:
-        return ""
-    said = f"{geometric:+.1%}"
-    low, high = row["improvement_ci95_low"], row["improvement_ci95_high"]
-    if low is not None and high is not None:
-        said += f" ({low:+.1%} to {high:+.1%})"
-    ratio = row["improvement_ratio_of_means"]
-    note = "" if ratio is None else summaries_disagree(geometric, ratio)
-    if note:
-        said += f"\n{note}"
-    if named:
-        said += f" over {_in_words(row[_OVER])}"
-    return said
+    def table(self) -> Table:
+        """Returns `rows` as a rich table, without columns that say the same of all jobs."""
+        columns: dict[str, list[str]] = {}
+        for key in self.differing:
+            columns[key] = [str(row[key]) for row in self.rows]
+        if not self.differing:
+            columns["job"] = [row["folder"] for row in self.rows]
+        shown: dict[str, list[str]] = {"judged by": [], self.judge.title: []}
+        for row in self.rows:
+            shown["judged by"].append(short_label(row["method"]))
+            shown[self.judge.title].append(_number(row[f"error_{self.judge.name}"]))
+        for constant in _CONSTANT:
+            values = [_number(row[f"{self.judge.name}_{constant}"]) for row in self.rows]
+            shown[f"{self.judge.heading},\n{short_label(constant)}"] = values
+        for metric in self.metrics:
+            if metric.headline:
+                shown[metric.title] = [_number(row[metric.name]) for row in self.rows]
+        shown["improvement\n(95 % interval)"] = [self._improvement(row) for row in self.rows]
+        shown["state"] = [row["state"] for row in self.rows]
+        for title, values in shown.items():
+            says_something = len(set(values)) > 1 or len(values) == 1
+            if any(values) and (says_something or title == self.judge.title):
+                columns[title] = values
+        columns["time [s]"] = [f"{row['seconds']:.1f}" for row in self.rows]
+        table = blank_table(title="The sweep, the smallest error on the same pairs first")
+        for title in columns:
+            is_text = title in {*self.differing, "job", "judged by", "state"}
+            table.add_column(title, justify="left" if is_text else "right", overflow="fold")
+        for cells in zip(*columns.values(), strict=True):
+            table.add_row(*cells)
+        return table
+
+    def _improvement(self, row: Mapping[str, Any]) -> str:
+        """Returns the improvement in words, with its baseline and what is to be known beside it."""
+        geometric = row.get("improvement_geometric")
+        if geometric is None:
+            return ""
+        said = f"{100 * geometric:+.1f} %"
+        low, high = row.get("improvement_ci95_low"), row.get("improvement_ci95_high")
+        if low is not None and high is not None:
+            said += f" ({100 * low:+.1f} to {100 * high:+.1f})"
+        baseline, comma, part = row["improvement_over"].partition(",")
+        said += f"\nover {short_label(baseline)}{comma}{part}"
+        known = {"geometric": geometric}
+        for name in ("ratio_of_means", "drivers"):
+            if row.get(f"improvement_{name}") is not None:
+                known[name] = row[f"improvement_{name}"]
+        return "\n".join([said, *doubts(known)])
+
+    def sentences(self) -> list[str]:
+        """Returns how the jobs were compared, and which is closest to the drivers."""
+        same = len({objective for _, objective in self._objectives}) <= 1
+        return Comparison(self.judge, self.ranking, same).sentences()
 
 
 def _number(value: float | None) -> str:

@@ -193,11 +193,27 @@ def column_of(metric: str, scope: str = "test") -> str:
     return f"{scope}_{metric}"
 
 
+RMSE_SPEED = MetricInfo(
+    name="rmse_speed",
+    unit="m/s",
+    direction="lower",
+    summary="mean",
+    heading="RMSE of speed",
+    meaning="root mean square difference between the simulated and the measured speed",
+    scopes=SCOPES,
+    headline=True,
+    distribution=OWN,
+)
+"""The error by which a job is judged whose objective is not known."""
+
+OBJECTIVE = "objective"
+"""The name of a metric that is the job's objective itself."""
+
 ALWAYS = ("rmse_speed", "rmse_gap", "collisions")
 """Measured in every job: the comparison of methods, the figures and the reports rest on them."""
 
 _TAKEN = re.compile(
-    r"(steady|full_trajectory|real|improvement|parameter|platoon|history|labels)(_.*)?"
+    r"(steady|full_trajectory|real|improvement|parameter|platoon|history|labels|objective)(_.*)?"
     r"|pair_id|recording|(leader|follower)_id|driver|cluster|style_score|fold|method|frames"
     r"|(train|validation)_loss|all"
 )
@@ -212,9 +228,15 @@ class MeasuredMetric:
     metric: Metric
     distribution: str
 
-    def info(self, measured: Collection[str]) -> MetricInfo:
-        """Returns what is to be known of it; `measured` are the scopes that were."""
+    def info(self, measured: Collection[str], *, judges: bool = False) -> MetricInfo:
+        """Returns what is to be known of it.
+
+        Args:
+            measured: the scopes that were.
+            judges: the job is judged by it: it is shown everywhere, of each scope.
+        """
         metric = self.metric
+        scopes = SCOPES if judges else metric.scopes
         return MetricInfo(
             name=self.name,
             unit=metric.unit,
@@ -222,8 +244,8 @@ class MeasuredMetric:
             summary=metric.summary,
             heading=metric.heading,
             meaning=metric.meaning,
-            scopes=tuple(scope for scope in metric.scopes if scope in measured),
-            headline=metric.headline,
+            scopes=tuple(scope for scope in scopes if scope in measured),
+            headline=metric.headline or judges,
             distribution=self.distribution,
         )
 
@@ -244,10 +266,12 @@ class MetricSet:
     Attributes:
         metrics: what is measured.
         left_out: what is installed and broken.
+        judge: name of the error by which methods, and jobs, are compared.
     """
 
     metrics: tuple[MeasuredMetric, ...]
     left_out: tuple[LeftOut, ...] = field(default=())
+    judge: str = RMSE_SPEED.name
 
     @classmethod
     def of(cls, chosen: str | Sequence[str] = ALL_OWN) -> MetricSet:
@@ -262,18 +286,18 @@ class MetricSet:
         found, left_out = [], []
         for entry in entries_of(chosen):
             try:
-                found.append(_made(entry))
+                found.append(made(entry))
             except PluginError as error:
                 if chosen != "all" or entry.distribution == OWN:
                     raise
                 left_out.append(leave_out(entry.name, entry.distribution, str(error)))
-        return cls(_ordered(found), tuple(left_out))
+        return cls(in_order(found), tuple(left_out))
 
     @classmethod
     def own(cls) -> MetricSet:
         """Makes cfx's own metrics."""
         entries = registry.entries("metric")
-        return cls(_ordered([_made(one) for one in entries if one.distribution == OWN]))
+        return cls(in_order([made(one) for one in entries if one.distribution == OWN]))
 
 
 def entries_of(chosen: str | Sequence[str] = ALL_OWN) -> tuple[registry.Entry, ...]:
@@ -301,7 +325,12 @@ def leave_out(name: str, distribution: str, reason: str) -> LeftOut:
     return LeftOut(name, distribution, reason)
 
 
-def _made(entry: registry.Entry) -> MeasuredMetric:
+def made(entry: registry.Entry) -> MeasuredMetric:
+    """Makes the metric of an entry.
+
+    Raises:
+        PluginError: its name stands for something else, or it is broken.
+    """
     if not re.fullmatch(r"[a-z][a-z0-9_]*", entry.name) or _TAKEN.fullmatch(entry.name):
         raise PluginError(
             f"{entry}: a metric cannot be called '{entry.name}', which stands for something else in"
@@ -311,5 +340,6 @@ def _made(entry: registry.Entry) -> MeasuredMetric:
     return MeasuredMetric(entry.name, metric, entry.distribution)
 
 
-def _ordered(metrics: Sequence[MeasuredMetric]) -> tuple[MeasuredMetric, ...]:
+def in_order(metrics: Sequence[MeasuredMetric]) -> tuple[MeasuredMetric, ...]:
+    """Returns metrics in the order in which they are shown."""
     return tuple(sorted(metrics, key=lambda one: (one.metric.order, one.name)))

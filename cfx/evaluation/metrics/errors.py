@@ -13,7 +13,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from cfx.evaluation.metrics.base import Metric, Trajectories
+from cfx.evaluation.metrics.base import RMSE_SPEED, Metric, Trajectories
 
 
 def masked_mean(values: Tensor, counted: Tensor) -> Tensor:
@@ -37,9 +37,9 @@ class ErrorMetric(Metric):
 class RmseSpeed(ErrorMetric):
     """Root mean square error of speed: sqrt(sum e^2 / K')."""
 
-    unit = "m/s"
-    heading = "RMSE speed"
-    meaning = "root mean square difference between the simulated and the measured speed"
+    unit = RMSE_SPEED.unit
+    heading = RMSE_SPEED.heading
+    meaning = RMSE_SPEED.meaning
     scopes = ("test", "steady", "full_trajectory")
     headline = True
     order = 1
@@ -53,7 +53,7 @@ class RmseGap(ErrorMetric):
     """Root mean square error of the gap: sqrt(sum e^2 / K')."""
 
     unit = "m"
-    heading = "RMSE gap"
+    heading = "RMSE of gap"
     meaning = (
         "root mean square difference between the simulated and the measured gap, bumper to bumper"
     )
@@ -70,7 +70,7 @@ class MaeSpeed(ErrorMetric):
     """Mean absolute error of speed: sum |e| / K'."""
 
     unit = "m/s"
-    heading = "MAE speed"
+    heading = "MAE of speed"
     meaning = "mean absolute difference between the simulated and the measured speed"
     order = 11
 
@@ -83,7 +83,7 @@ class MaeGap(ErrorMetric):
     """Mean absolute error of the gap: sum |e| / K'."""
 
     unit = "m"
-    heading = "MAE gap"
+    heading = "MAE of gap"
     meaning = "mean absolute difference between the simulated and the measured gap"
     order = 12
 
@@ -96,7 +96,7 @@ class NrmseSpeed(ErrorMetric):
     """Normalised RMSE of speed (Punzo et al. 2021): RMSE / sqrt(sum v^2 / K')."""
 
     unit = ""
-    heading = "NRMSE speed"
+    heading = "NRMSE of speed"
     meaning = "RMSE of speed over the root mean square of the measured speed"
     order = 13
 
@@ -108,7 +108,7 @@ class NrmseGap(ErrorMetric):
     """Normalised RMSE of the gap (Punzo et al. 2021): RMSE / sqrt(sum s^2 / K')."""
 
     unit = ""
-    heading = "NRMSE gap"
+    heading = "NRMSE of gap"
     meaning = "RMSE of the gap over the root mean square of the measured gap"
     order = 14
 
@@ -124,7 +124,7 @@ class RmseAcceleration(ErrorMetric):
     """
 
     unit = "m/s2"
-    heading = "RMSE acceleration"
+    heading = "RMSE of acceleration"
     meaning = "root mean square difference between the simulated and the measured acceleration"
     order = 15
 

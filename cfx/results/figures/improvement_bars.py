@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from cfx.evaluation.metrics.base import RMSE_SPEED
 from cfx.figures import canvas, colours, wording
 from cfx.results.figure import JobFigure
 
@@ -87,13 +88,18 @@ class ImprovementBars:
     undefined: int
 
 
-def improvement_title(baseline: str) -> str:
-    """Returns what an axis of improvements over a baseline is called."""
-    return f"improvement of the RMSE of speed over {wording.method_label(baseline)}"
+def improvement_title(baseline: str, error: str = RMSE_SPEED.heading) -> str:
+    """Returns what an axis of improvements of an error over a baseline is called."""
+    return f"improvement of the {error} over {wording.method_label(baseline)}"
 
 
 def improvement_axis(
-    values: canvas.Array, marks: Sequence[float] = (), *, baseline: str, what: str = "improvements"
+    values: canvas.Array,
+    marks: Sequence[float] = (),
+    *,
+    baseline: str,
+    error: str = RMSE_SPEED.heading,
+    what: str = "improvements",
 ) -> ImprovementAxis:
     """Chooses an axis that a few very bad improvements do not shrink.
 
@@ -105,9 +111,10 @@ def improvement_axis(
         marks: further values that should be in view, such as the mean and the ends of its interval;
             one far below the fence does not move the axis.
         baseline: the method that the policy is compared with.
+        error: which error is smaller.
         what: what is cut off, in the note.
     """
-    title, known = improvement_title(baseline), canvas.finite(values)
+    title, known = improvement_title(baseline, error), canvas.finite(values)
     undefined = len(np.asarray(values).ravel()) - len(known)
     if not len(known):
         note = f"No pair has a defined improvement ({undefined} are undefined)."
@@ -147,6 +154,7 @@ def improvement_bars(
     improvements: Sequence[canvas.Array],
     *,
     baseline: str = "driver_specific",
+    error: str = RMSE_SPEED.heading,
     marks: Sequence[float] = (),
 ) -> ImprovementBars:
     """Chooses the bars of every pair, best to worst in each job.
@@ -156,10 +164,11 @@ def improvement_bars(
         pair_ids: of each job's pairs.
         improvements: of each job's pairs, fractions.
         baseline: the method that the policy is compared with.
+        error: which error is smaller.
         marks: as in `improvement_axis`.
     """
     every = np.concatenate([np.empty(0), *improvements])
-    axis = improvement_axis(every, marks, baseline=baseline)
+    axis = improvement_axis(every, marks, baseline=baseline, error=error)
     series = []
     for name, ids, values in zip(names, pair_ids, improvements, strict=True):
         series.append(_series(name, ids, np.asarray(values, dtype=np.float64), axis.low))
@@ -302,8 +311,9 @@ class ImprovementPerDriver(JobFigure):
 
     title = "Improvement of every pair over driver-specific calibration"
     caption = (
-        "A bar per pair, in the colour of the method that was closer to the driver, with mean,"
-        " trimmed mean, median and the 95 % interval of the mean."
+        "A bar per pair, in the colour of the method that was closer to the driver, with the"
+        " geometric improvement over drivers, its 95 % interval, that of the mean errors, and the"
+        " median."
     )
     order = 10
 
@@ -323,6 +333,7 @@ def draw_improvement(result: Result, baseline: str) -> Figure:
         [rows["pair_id"].astype(str).tolist()],
         [rows[f"improvement_over_{baseline}"].to_numpy(dtype=float)],
         baseline=baseline,
+        error=result.judge.heading,
         marks=(summary.geometric, summary.ci95_low, summary.ci95_high),
     )
     return draw_improvements(bars, summary)

@@ -437,7 +437,8 @@ def drives(result: Result, pair_id: str | Sequence[str] | None = None, count: in
         name = RankedPair(wording.shortened(ranked.pair_id), ranked.rank, ranked.improvement).title
         if np.isfinite(ranked.improvement):
             name += f":  {wording.percent(ranked.improvement)}"
-            explained = f"percentages: {improvement_title('driver_specific')}"
+            title = improvement_title("driver_specific", result.judge.heading)
+            explained = f"percentages: {title}"
         elif {"driver_specific", "policy"} <= set(result.shown_methods):
             name += ":  improvement undefined"
         speed = _errors_text(result, trajectory.pair_id, "speed", "m/s")
@@ -517,7 +518,7 @@ def chosen_pairs(
     if pair_id is None:
         values = gains.to_numpy(dtype=float)
         if is_calibration:
-            values = -rows["rmse_speed"].to_numpy(dtype=float)
+            values = -rows[result.judge.name].to_numpy(dtype=float)
         ranked = rank_pairs(list(gains.index), values, count)
         if is_calibration:
             ranked = tuple(RankedPair(pair.pair_id, pair.rank, math.nan) for pair in ranked)
@@ -556,7 +557,7 @@ class RankedPair:
     Attributes:
         pair_id: which pair.
         rank: "best", "median", "worst", "3 of 12"; "" where there is nothing to rank.
-        improvement: of the RMSE of speed over driver-specific calibration, a fraction; NaN where
+        improvement: of the error over driver-specific calibration, a fraction; NaN where
             it is not defined.
     """
 

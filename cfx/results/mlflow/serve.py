@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from urllib.parse import quote
 
 from cfx.errors import ConfigError, TrackingError
-from cfx.evaluation.headline import PERCENT, RESULT, SPEED_ERROR
+from cfx.evaluation.headline import PERCENT, RESULT, TESTED
 
 if TYPE_CHECKING:
     from mlflow import MlflowClient
@@ -34,20 +34,11 @@ JOBS = 3
 COMPARED = 10
 """Most jobs on one page that compares them side by side; the best of a larger sweep."""
 
-IMPROVEMENT = "metrics.`improvement/rmse_speed/driver_specific/geometric`"
-"""What the tables of jobs are sorted by."""
-
-_COLUMNS = (
-    "tags.`model`",
-    "tags.`policy`",
-    "tags.`learner`",
-    f"tags.`{RESULT}`",
+_BEFORE_ERROR = ("tags.`model`", "tags.`policy`", "tags.`learner`", f"tags.`{RESULT}`")
+_AFTER_ERROR = (
     f"metrics.`{PERCENT}`",
-    f"metrics.`{SPEED_ERROR}`",
-    "metrics.`collisions/policy`",
-    IMPROVEMENT,
-    "metrics.`rmse_speed/driver_specific`",
-    "metrics.`rmse_speed/default`",
+    "metrics.`collisions`",
+    f"tags.`{TESTED}`",
     "tags.`protocol`",
     "tags.`data`",
     "tags.`optimizer`",
@@ -55,7 +46,8 @@ _COLUMNS = (
     "tags.`style.cluster`",
     "tags.`seed`",
 )
-"""Columns of those tables: what it is, and the improvement with its interval, come first."""
+"""Columns of the tables of jobs: what it is and its result come first, then the error by which the
+table is sorted. Jobs with another `TESTED` do not compare."""
 
 _WIDTHS = {
     "tags.`model`": 84,
@@ -65,25 +57,19 @@ _WIDTHS = {
 }
 """Pixels of columns that need more or less than MLflow gives them."""
 
-_CHARTS = f"{PERCENT}|{SPEED_ERROR}|improvement/rmse_speed/driver_specific/geometric|rmse_speed/"
-"""Metrics that MLflow's charts show, a regular expression."""
-
 _SECTION = "cfx"
 
-_FIRST_CHARTS = (
-    {"uuid": "cfx-improvement", "type": "BAR", "metricKey": PERCENT, "runsCountToCompare": 20},
-    {
-        "uuid": "cfx-difference",
-        "type": "DIFFERENCE",
-        "chartName": "Settings that differ",
-        "compareGroups": ["Parameters"],
-        "showChangeFromBaseline": False,
-        "showDifferencesOnly": True,
-        "baselineColumnUuid": "",
-        "runsCountToCompare": 10,
-    },
-)
-"""Charts that come before those that MLflow makes of every metric."""
+_DIFFERENCE = {
+    "uuid": "cfx-difference",
+    "type": "DIFFERENCE",
+    "chartName": "Settings that differ",
+    "compareGroups": ["Parameters"],
+    "showChangeFromBaseline": False,
+    "showDifferencesOnly": True,
+    "baselineColumnUuid": "",
+    "runsCountToCompare": 10,
+}
+"""The chart beside those of the error and of the improvement, before those that MLflow makes."""
 
 _READY_S = 120.0
 """How long the server may take to answer, s."""
@@ -226,24 +212,28 @@ def _links(store: str, port: int) -> list[str]:
             lines += _sweep_lines(client, sweep, address)
         for job in jobs:
             page = f"#/experiments/{job.info.experiment_id}/runs/{job.info.run_id}"
-            lines.append(f"job {job.info.run_name}, {_began(job)}{_improvement(job)}")
+            lines.append(f"job {job.info.run_name}, {_began(job)}{_result(job)}")
             lines.append(f"  page:    {address}{page}?workflowType=machine_learning")
         lines += _experiment_lines(client, names, address)
         return lines
 
 
 def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
+    from cfx.results.mlflow.tracker import common_error
+
     experiment, name = str(parent.info.experiment_id), parent.data.tags["cfx.sweep_parent"]
     chosen = f"tags.`cfx.sweep` = '{name}'"
-    jobs = client.search_runs(
-        [experiment], chosen, order_by=[f"{IMPROVEMENT} DESC"], max_results=1000
-    )
-    groups = _over_seeds(jobs)
+    jobs = client.search_runs([experiment], chosen, max_results=1000)
+    error = common_error(jobs)
+    groups = _over_seeds(jobs, error)
     found = list(itertools.chain.from_iterable(groups))
-    table = _shared_view(client, experiment, chosen)
+    table = _shared_view(client, experiment, chosen, error)
     title = f"sweep {name}, {_began(parent)}: {len(found)} jobs"
     if groups:
-        title += _best(groups[0])
+        title += _best(groups[0], error)
+    tested = {run.data.tags.get(TESTED, "") for run in found} - {""}
+    if len(tested) > 1:
+        title += f"; tested on {len(tested)} sets of pairs, which do not compare ({TESTED})"
     lines = [
         title,
         f"  table:   {address}{table}",
@@ -258,8 +248,8 @@ def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
     return lines
 
 
-def _over_seeds(runs: Sequence[Any]) -> list[list[Any]]:
-    """Returns the runs, those that differ in the seed alone together, the best mean first.
+def _over_seeds(runs: Sequence[Any], error: str) -> list[list[Any]]:
+    """Returns the runs, those that differ in the seed alone together, the least mean error first.
 
     A single seed that was lucky so comes before no setting that is better on average.
     """
@@ -267,72 +257,86 @@ def _over_seeds(runs: Sequence[Any]) -> list[list[Any]]:
     for run in runs:
         settings = {key: value for key, value in run.data.params.items() if key != "seed"}
         groups.setdefault(tuple(sorted(settings.items())), []).append(run)
-    return sorted(groups.values(), key=_mean_improvement, reverse=True)
+    return sorted(groups.values(), key=lambda group: _mean_error(group, error))
 
 
-def _improvements(runs: Sequence[Any]) -> list[float]:
-    """Returns the improvements of those runs that have one."""
+def _errors(runs: Sequence[Any], error: str) -> list[float]:
+    """Returns the errors of those runs that have one."""
     values = []
     for run in runs:
-        value = run.data.metrics.get("improvement/rmse_speed/driver_specific/geometric", math.nan)
+        value = run.data.metrics.get(error, math.nan)
         if math.isfinite(value):
             values.append(value)
     return values
 
 
-def _mean_improvement(runs: Sequence[Any]) -> float:
-    """Returns the runs' mean improvement, minus infinity if none has one."""
-    values = _improvements(runs)
-    return sum(values) / len(values) if values else -math.inf
+def _mean_error(runs: Sequence[Any], error: str) -> float:
+    """Returns the runs' mean error, infinity if none has one."""
+    values = _errors(runs, error)
+    return sum(values) / len(values) if values else math.inf
 
 
-def _best(runs: Sequence[Any]) -> str:
-    """Returns the improvement of the best setting, over its seeds if there are several."""
-    values = _improvements(runs)
-    if len(values) < 2:
-        return _improvement(runs[0], "best ")
-    return f", best improvement {_mean_improvement(runs):.1%} (mean of {len(values)} seeds)"
+def _best(runs: Sequence[Any], error: str) -> str:
+    """Returns the error of the best setting, over its seeds if there are several."""
+    values = _errors(runs, error)
+    if not values:
+        return f", {runs[0].info.status}"
+    said = f", smallest {error} {_mean_error(runs, error):.3f}"
+    return f"{said} (mean of {len(values)} seeds)" if len(values) > 1 else said
 
 
 def _experiment_lines(client: MlflowClient, names: dict[str, str], address: str) -> list[str]:
     """Returns a page for each experiment that holds jobs, or for each if none does."""
+    from cfx.results.mlflow.tracker import common_error
+
     used = [one for one in names if client.search_runs([one], max_results=1)]
     lines = []
     for experiment in used or names:
-        page = _shared_view(client, experiment, "tags.`cfx.sweep_parent` IS NULL")
+        chosen = "tags.`cfx.sweep_parent` IS NULL"
+        jobs = client.search_runs([experiment], chosen, max_results=1000)
+        page = _shared_view(client, experiment, chosen, common_error(jobs))
         lines.append(
-            f"all jobs of experiment {names[experiment]}, the best first\n"
+            f"all jobs of experiment {names[experiment]}, the smallest error first\n"
             f"  table:   {address}{page}"
         )
     return lines
 
 
-def _shared_view(client: MlflowClient, experiment: str, chosen: str) -> str:
-    """Keeps a view of the table of runs in the store, the best run first, and returns its page.
+def _shared_view(client: MlflowClient, experiment: str, chosen: str, error: str) -> str:
+    """Keeps a view of the table of runs in the store, the least error first; returns its page.
 
     MLflow hides metrics until a user picks columns; only a "shared view", a tag of the experiment,
     carries columns in a link. The page comes without the server's address.
 
     Args:
         chosen: MLflow's search for the runs to show.
+        error: the metric by which they are sorted.
     """
     widths = dict(_WIDTHS)
-    for column in _COLUMNS:
+    columns = [*_BEFORE_ERROR, f"metrics.`{error}`", *_AFTER_ERROR]
+    for column in columns:
         if column.startswith("metrics"):
             widths[column] = 8 * len(column) - 40
-    section = {"uuid": _SECTION, "name": "Improvement", "display": True}
-    always = {"deleted": False, "isGenerated": False}
-    charts = [{**chart, "metricSectionId": _SECTION, **always} for chart in _FIRST_CHARTS]
+    section = {"uuid": _SECTION, "name": "Error and improvement", "display": True}
+    always = {"deleted": False, "isGenerated": False, "metricSectionId": _SECTION}
+    charts: list[dict[str, Any]] = []
+    for metric in (error, PERCENT):
+        bars = {"type": "BAR", "metricKey": metric, "runsCountToCompare": 20}
+        charts.append({"uuid": f"cfx-{metric}", **bars, **always})
+    charts.append({**_DIFFERENCE, **always})
     view = {
         "searchFilter": chosen,
-        "orderByKey": IMPROVEMENT,  # sorted by date, MLflow would fold jobs away under their sweep
-        "orderByAsc": False,
-        "selectedColumns": list(_COLUMNS),
-        "columnOrder": list(_COLUMNS),
+        # Sorted by date, MLflow would fold jobs away under their sweep.
+        "orderByKey": f"metrics.`{error}`",
+        "orderByAsc": True,
+        "selectedColumns": columns,
+        "columnOrder": columns,
         "columnWidths": widths,
-        "chartsSearchFilter": _CHARTS,
+        "chartsSearchFilter": f"{error}|{PERCENT}",
         "isAccordionReordered": True,  # else MLflow sorts the sections by their names
-        "compareRunSections": [{**section, "isReordered": False, **always}],
+        "compareRunSections": [
+            {**section, "isReordered": False, "deleted": False, "isGenerated": False}
+        ],
         "compareRunCharts": charts,
     }
     key = "cfx-" + hashlib.sha256(chosen.encode()).hexdigest()[:12]
@@ -350,9 +354,6 @@ def _began(run: Any) -> str:
     return time.strftime("%Y-%m-%d %H:%M", time.localtime(run.info.start_time / 1000))
 
 
-def _improvement(run: Any, which: str = "") -> str:
-    """Returns a run's improvement in words; how the run ended if it has none."""
-    value = run.data.metrics.get("improvement/rmse_speed/driver_specific/geometric")
-    if value is None or math.isnan(value):
-        return f", {run.info.status}"
-    return f", {which}improvement {value:.1%}"
+def _result(run: Any) -> str:
+    """Returns a run's result in words; how the run ended if it has none."""
+    return f", {run.data.tags.get(RESULT) or run.info.status}"

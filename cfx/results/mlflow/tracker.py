@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import logging
+import math
 import os
 import re
 import shlex
@@ -20,13 +21,22 @@ from urllib.parse import quote, urlencode
 import numpy as np
 import pandas as pd
 
+from cfx.core.distributions import OWN
 from cfx.data.pairs import PairSet
 from cfx.errors import CfxError, TrackingError
-from cfx.evaluation.headline import RESULT, fitted_errors, headline
+from cfx.evaluation.headline import (
+    DEFAULT_ERROR,
+    ERROR,
+    RESULT,
+    TESTED,
+    fitted_errors,
+    headline,
+    with_unit,
+)
 from cfx.evaluation.result import Purpose
 from cfx.learners.curves import over_networks
 from cfx.results import provenance
-from cfx.results.folder import CONFIG, DATA, METRICS
+from cfx.results.folder import CONFIG, DATA, METRICS, typed_overrides
 from cfx.results.mlflow.store import Store, open_store, tracking_uri, translate_errors
 from cfx.results.table import file_of, installed
 from cfx.results.tracker import Tracker
@@ -104,7 +114,8 @@ class MlflowTracker(Tracker):
             tracking_uri(config.tracking.uri),
             experiment=config.tracking.experiment,
             run_name=_run_name(config, names),
-            parameters=provenance.flatten(values),
+            parameters=_parameters(values, _compared(config, names), folder),
+            whole=values,
             tags=tags,
             plugins=plugins,
             sweep=config.tracking.sweep,
@@ -120,6 +131,7 @@ class MlflowTracker(Tracker):
         experiment: str = "cfx",
         run_name: str,
         parameters: Mapping[str, str],
+        whole: Mapping[str, Any] | None = None,
         tags: Mapping[str, str] | None = None,
         plugins: Mapping[str, str] | None = None,
         sweep: str | None = None,
@@ -130,7 +142,8 @@ class MlflowTracker(Tracker):
 
         Args:
             uri: of the store, absolute.
-            parameters: flat; too long values are cut, and marked as cut.
+            parameters: what the run is compared by; too long values are cut, and marked as cut.
+            whole: the whole configuration, by which the same job is known; None: `parameters`.
             tags: shown in the table of runs, which can be grouped by them.
             plugins: distribution -> version.
             sweep: name that the jobs of a multirun share; they get a common parent run.
@@ -145,7 +158,7 @@ class MlflowTracker(Tracker):
             **provenance.plugin_tags(plugins or {}),
             **provenance.process_tags(),
             "cfx.version": provenance.version(),
-            "cfx.app.job": _fingerprint(known, tags or {}),
+            "cfx.app.job": _fingerprint(whole or known, tags or {}),
             "mlflow.source.name": "cfx",
             "mlflow.source.type": "LOCAL",
             "mlflow.user": provenance.user(),
@@ -177,9 +190,14 @@ class MlflowTracker(Tracker):
         folder, pairs = result.folder, result.evaluation.recorded
         assert folder is not None
         assert pairs is not None
-        values, words = headline(result.metrics)
-        self.log_metrics({**values, **_fitted(result), **result.metrics})
-        tags = {RESULT: words, "mlflow.note.content": description}
+        values, words = headline(result.metrics, result.judge)
+        self.log_metrics({**values, **_fitted(result), **_of_plugins(result)})
+        tags = {
+            RESULT: words,
+            ERROR: with_unit(result.judge.name, result.judge.unit),
+            TESTED: _tested(result),
+            "mlflow.note.content": description,
+        }
         is_calibration = result.purpose is Purpose.CALIBRATION
         if is_calibration:
             tags["learner"] = "none"
@@ -365,6 +383,48 @@ def _fitted(result: Result) -> dict[str, float]:
     return fitted_errors({str(name).removeprefix("train_"): mean for name, mean in means.items()})
 
 
+def _tested(result: Result) -> str:
+    """Returns what names the frames that were tested: jobs with another name do not compare."""
+    if not len(result.pairs):
+        return ""
+    tested = result.pairs.drop_duplicates("pair_id")[["pair_id", "frames"]].sort_values("pair_id")
+    digest = hashlib.sha256(tested.to_csv(index=False).encode()).hexdigest()[:8]
+    return f"{len(tested)} pairs, {digest}"
+
+
+def _compared(config: JobConfig, names: Mapping[str, str]) -> dict[str, str]:
+    """Returns the chosen components; a calibration has no learner, whatever the group says."""
+    return {**names, "learner": "none"} if config.is_calibration else dict(names)
+
+
+def _parameters(
+    values: Mapping[str, Any], names: Mapping[str, str], folder: Path
+) -> dict[str, str]:
+    """Returns what runs are compared by: the chosen components, the seed and what was typed.
+
+    The whole configuration is a file of the run. What was typed of tracking, and where Hydra
+    writes, says nothing of the job.
+    """
+    parameters = {**names, "seed": str(values.get("seed", ""))}
+    flat = provenance.flatten(values)
+    for override in typed_overrides(folder) or ():
+        key = override.partition("=")[0].lstrip("+~")
+        if key in flat and not key.startswith(("tracking.", "output.")):
+            parameters[key] = flat[key]
+    return parameters
+
+
+def _of_plugins(result: Result) -> dict[str, float]:
+    """Returns the headline metrics that plugins bring, of the method that the job is judged by."""
+    values = {}
+    for metric in result.known_metrics:
+        value = result.metric(metric.name, result.judged)
+        is_new = metric.distribution != OWN and metric.name != result.judge.name
+        if metric.headline and is_new and math.isfinite(value):
+            values[with_unit(metric.name, metric.unit)] = value
+    return values
+
+
 def _run_name(config: JobConfig, names: Mapping[str, str]) -> str:
     """Returns what a run is called: its components; in a sweep, whose jobs have many, its seed.
 
@@ -414,17 +474,23 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
     return {"signature": signature, "input_example": frame}
 
 
-def sweep_link(experiment_id: str, sweep: str) -> str:
+def common_error(runs: Sequence[Any]) -> str:
+    """Returns the metric by which runs are sorted: what all minimised, else the RMSE of speed."""
+    errors = {run.data.tags[ERROR] for run in runs if ERROR in run.data.tags}
+    return errors.pop() if len(errors) == 1 else DEFAULT_ERROR
+
+
+def sweep_link(experiment_id: str, sweep: str, error: str = DEFAULT_ERROR) -> str:
     """Returns the part of the address behind the server's that shows the jobs of a sweep.
 
-    They stand side by side, the best first.
+    They stand side by side, the smallest error first.
     """
     asked = {
         "searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'",
         # Sorted by date, MLflow's page would fold the jobs away under their parent, and draw no
         # charts.
-        "orderByKey": "metrics.`improvement/rmse_speed/driver_specific/geometric`",
-        "orderByAsc": "false",
+        "orderByKey": f"metrics.`{error}`",
+        "orderByAsc": "true",
         "compareRunsMode": "CHART",
         "workflowType": "machine_learning",
     }
@@ -453,8 +519,13 @@ def end_sweep(uri: str, experiment: str, sweep: str) -> tuple[str, ...]:
         if not parents:
             return ()
         _settle(store, str(parents[0].info.run_id), _safe(sweep))
+        chosen = f"tags.`cfx.sweep` = '{_safe(sweep)}'"
+        jobs = store.client.search_runs([store.experiment_id], chosen, max_results=1000)
+        link = sweep_link(store.experiment_id, sweep, common_error(jobs))
+        note = f"[All jobs of this sweep]({link})"
+        store.client.set_tag(str(parents[0].info.run_id), "mlflow.note.content", note)
     address, first = _address(store.uri)
-    return (*first, f"All jobs of this sweep: {address}/{sweep_link(store.experiment_id, sweep)}")
+    return (*first, f"All jobs of this sweep: {address}/{link}")
 
 
 def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping[str, str]) -> str:
@@ -614,9 +685,9 @@ def _shortened(text: str, length: int) -> str:
     return text[: length - 1] + "…"
 
 
-def _fingerprint(parameters: Mapping[str, str], tags: Mapping[str, str]) -> str:
+def _fingerprint(values: Mapping[str, Any], tags: Mapping[str, str]) -> str:
     """Returns what two starts of the same job in the same folder share."""
-    text = json.dumps([dict(sorted(parameters.items())), tags.get("cfx.folder", "")])
+    text = json.dumps([values, tags.get("cfx.folder", "")], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()[:32]
 
 

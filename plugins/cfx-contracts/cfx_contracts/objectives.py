@@ -20,6 +20,9 @@ from cfx.calibration.contract import (
 )
 from cfx.calibration.objectives import FrameValues, Objective
 from cfx.core.contract import expect_close
+from cfx.evaluation.metrics.base import MetricSet
+from cfx.evaluation.metrics.contract import trajectories
+from cfx.evaluation.metrics.objective import ObjectiveMetric, judged_by
 from cfx_contracts import contract_of
 
 
@@ -128,6 +131,19 @@ def one_frame_needs_no_dimension_of_time(objective: Objective) -> None:
         expect_close(
             one, many[0], msg="a rollout asks for the terms of one frame `(*batch,)` at a time"
         )
+
+
+def it_is_the_metric_that_it_names(objective: Objective) -> None:
+    if not objective.metric:
+        return
+    metric = judged_by(MetricSet.of(["rmse_speed"]), objective).metrics[0].metric
+    frames = trajectories()
+    expect_close(
+        ObjectiveMetric("", objective).compute(frames),
+        metric.compute(frames),
+        msg=f"`metric` says that the loss is the metric {objective.metric}: both must be one"
+        ' number; "" where there is no such metric',
+    )
 
 
 def gradients_are_right(objective: Objective) -> None:

@@ -116,6 +116,10 @@ class Overwriting(SpeedRmse):
         return (frames.speed.sub_(frames.measured_speed).square(),)
 
 
+class Misnamed(SpeedRmse):
+    metric = "rmse_gap"
+
+
 BROKEN: dict[str, tuple[Objective, Any, str]] = {
     "silent": (Silent(), first.says_its_unit_and_its_signals, "says the unit"),
     "blind": (Blind(), first.says_its_unit_and_its_signals, "reads the speed or the gap"),
@@ -129,6 +133,7 @@ BROKEN: dict[str, tuple[Objective, Any, str]] = {
     "drifting": (Drifting(), checks.time_may_be_any_dimension, "which dimension is time"),
     "drifting in parts": (Drifting(), checks.parts_add_up_to_the_whole, "frame by frame"),
     "growing": (Growing(), checks.one_frame_needs_no_dimension_of_time, "as many tensors"),
+    "misnamed": (Misnamed(), checks.it_is_the_metric_that_it_names, "must be one"),
     "double": (Double(), first.float32_agrees_with_float64, "computes in the dtype"),
     "detached": (Detached(), checks.gradients_are_right, "Jacobian mismatch"),
     "vertical": (Vertical(), checks.the_slope_at_a_perfect_simulation_is_finite, "epsilon"),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from cfx.plugin import MetricInfo, Purpose, Result, wording
+from cfx.plugin import MetricInfo, Purpose, Result, comparison, wording
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,14 @@ def any_has_metric(
     return any(job.has_metric(name, method, scope) for job in jobs)
 
 
+def judge_of(jobs: Iterable[Result]) -> MetricInfo:
+    """Returns the error by which jobs are compared: what all minimised, else the RMSE of speed."""
+    return comparison.common_judge(
+        [(job.judge, comparison.objective_of(job.judge, job.data)) for job in jobs]
+    )
+
+
 def metric_title(metric: MetricInfo) -> str:
-    """Returns a heading with the unit: "RMSE speed (m/s)"."""
+    """Returns a heading with the unit: "RMSE of speed (m/s)"."""
     heading = metric.heading[:1].upper() + metric.heading[1:]
     return f"{heading} ({wording.pretty_unit(metric.unit)})" if metric.unit else heading

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from cfx.errors import ConfigError
-from cfx.plugin import Purpose, Result, flatten, wording
+from cfx.plugin import Purpose, Result, comparison, flatten, wording
 from cfx_report.jobs import any_baselines
 
 GROUPS = ("model", "policy", "learner", "protocol", "objective", "optimizer", "data")
@@ -192,6 +192,11 @@ def rows_over_seeds(jobs: Sequence[Result]) -> tuple[Row, ...]:
     if len({job.setting("seed") for job in jobs}) < 2:
         return rows_of(jobs)
     return rows_of(jobs, "seed")
+
+
+def comparison_of(jobs: Sequence[Result]) -> comparison.Comparison:
+    """Returns the jobs beside one another, those that differ in the seed alone as one."""
+    return comparison.Comparison.of({row.name: row.jobs for row in rows_over_seeds(jobs)})
 
 
 def methods_of(rows: Sequence[Row]) -> list[str]:

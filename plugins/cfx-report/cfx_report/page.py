@@ -14,8 +14,8 @@ import numpy as np
 
 from cfx.plugin import Purpose, Result, colours, drawing, files, headline, registry, style, wording
 from cfx_report.inline import inline_scripts, security_policy
-from cfx_report.jobs import Runs, of_purpose
-from cfx_report.names import Row, rows_over_seeds
+from cfx_report.jobs import Runs, metric_title, of_purpose
+from cfx_report.names import comparison_of
 from cfx_report.section import MOST, Section, View, lacking
 
 if TYPE_CHECKING:
@@ -165,10 +165,12 @@ def summary(jobs: Sequence[Result]) -> list[str]:
         references += [_calibration(job) for job in constant]
     else:
         references.append(f"{len(constant)} jobs are calibrations, without adaptation.")
+    if len(jobs) > 1:
+        references += comparison_of(jobs).sentences()
     if len(compared) <= _MOST:
         return [first, *map(_verdict, compared), *warnings, *references]
     counts = f"{_counts(compared)} (by the 95 % interval of the improvement)."
-    return [first, counts, _best(jobs), *warnings, *references]
+    return [first, counts, *warnings, *references]
 
 
 def _few(jobs: Sequence[Result]) -> list[str]:
@@ -199,30 +201,6 @@ def _counts(jobs: Sequence[Result]) -> str:
     return "; ".join(said)
 
 
-def _best(jobs: Sequence[Result]) -> str:
-    """Says which job improves most, or which jobs over their seeds: no lucky seed is picked."""
-    rows = []
-    for row in rows_over_seeds(jobs):
-        if of_purpose(row.jobs, Purpose.ADAPTATION):
-            rows.append(row)
-    best = max(rows, key=_mean_for_ranking)
-    if len(best.jobs) == 1:
-        return f"The best: {_verdict(best.jobs[0])}"
-    gains = best.improvements("geometric", "driver_specific")
-    least, most = (wording.percent(float(end), 1) for end in (np.nanmin(gains), np.nanmax(gains)))
-    return (
-        f"The best mean over seeds: {best.name}. Improvement of the RMSE of speed:"
-        f" {wording.percent(float(np.nanmean(gains)), 1)} on average ({least} to {most} in"
-        f" {len(best.jobs)} seeds)."
-    )
-
-
-def _mean_for_ranking(row: Row) -> float:
-    means = row.improvements("geometric", "driver_specific")
-    known = means[np.isfinite(means)]
-    return float(known.mean()) if len(known) else -np.inf
-
-
 def _reference(job: Result) -> str:
     """Says what a policy reaches that sets the acceleration itself."""
     speed, gap = job.metric("rmse_speed", "policy"), job.metric("rmse_gap", "policy")
@@ -234,13 +212,13 @@ def _reference(job: Result) -> str:
 
 def _calibration(job: Result) -> str:
     """Says how close constant parameters come."""
-    errors = []
+    judge, errors = job.judge, []
     for method in job.methods:
-        error = job.metric("rmse_speed", method)
+        error = job.metric(judge.name, method)
         if method != "policy" and np.isfinite(error):
             errors.append(f"{wording.short_label(method)} {error:.3f}")
     return (
-        f"{job.name}: a calibration; its parameters stay constant. RMSE of speed (m/s):"
+        f"{job.name}: a calibration; its parameters stay constant. {metric_title(judge)}:"
         f" {', '.join(errors)}."
     )
 
@@ -271,7 +249,7 @@ def _verdict(job: Result) -> str:
     if "pooled" in job.baselines():
         pooled = f"; over pooled calibration {_gain(job, 'pooled')}"
     gain = _gain(job, "driver_specific")
-    return f"{job.name}: {_side(job)}. Improvement of the RMSE of speed: {gain}{pooled}."
+    return f"{job.name}: {_side(job)}. Improvement of the {job.judge.heading}: {gain}{pooled}."
 
 
 def _gain(job: Result, baseline: str) -> str:

@@ -125,17 +125,17 @@ def draw(
 
 def _compared(jobs: Sequence[Result], folder: Path, formats: Sequence[str]) -> list[str]:
     """Draws jobs against the one that is closest to the drivers; returns what to tell the user."""
-    from cfx.plugin import drawing, statistics
+    from cfx.plugin import comparison, drawing
     from cfx_report.figures.models import draw_models
 
-    errors = {job.name: job.errors for job in jobs}
-    ranking = statistics.ranking_of(errors)
-    if not ranking.against:
+    compared = comparison.Comparison.of({job.name: [job] for job in jobs})
+    if not compared.ranking.against:
         return ["The jobs share no pairs on the same frames, so that they are not compared."]
-    figure = draw_models(errors, ranking.against)
+    errors = {job.name: job.errors_by(compared.judge.name) for job in jobs}
+    figure = draw_models(errors, compared.ranking.against, compared.judge)
     paths = [drawing.write_figure(figure, folder / f"models.{form}") for form in formats]
     return [
-        statistics.verdict(ranking),
+        *compared.sentences(),
         *[f"Model against model: {path.absolute()}" for path in paths],
     ]
 

@@ -16,7 +16,7 @@ from rich.console import Console
 import cfx
 from cfx.app.job.console import methods_table
 from cfx.app.sweep.folder import JobStatus
-from cfx.app.sweep.summary import metric_columns, rows, summary_table, write_summary
+from cfx.app.sweep.summary import SweepSummary
 from cfx.errors import PluginError
 from cfx.evaluation.metrics.base import ALWAYS, MetricSet
 from tests.broken_plugins import QUICK
@@ -83,9 +83,7 @@ def test_a_plugins_metric_stands_in_every_result(
     from mlflow import MlflowClient
 
     run = MlflowClient(store).get_run(result.run_id)
-    assert run.data.metrics["mean_gap/driver_specific"] == pytest.approx(
-        written["mean_gap/driver_specific"]
-    )
+    assert run.data.metrics["mean_gap_m"] == pytest.approx(written["mean_gap/driver_specific"])
     assert run.data.tags["cfx.plugin.mean-gap-metrics"] == "1.0"
 
     out = io.StringIO()
@@ -103,6 +101,7 @@ def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> No
         folder = tmp_path / name
         folder.mkdir()
         metrics = {
+            "rmse_speed/policy": 0.5,
             "improvement/rmse_speed/driver_specific/geometric": 0.1,
             "mean_gap/policy": value,
             "theil_u/policy": 0.01,
@@ -119,15 +118,14 @@ def test_a_plugins_metric_stands_in_the_summary_of_a_sweep(tmp_path: Path) -> No
     (old / "data.json").write_text("{}")
     statuses[old] = JobStatus(0, "", "", ("model=old",))
 
-    table = rows(statuses)
-    write_summary(tmp_path / "summary.csv", table)
+    summary = SweepSummary.of(statuses)
+    summary.write(tmp_path / "summary.csv")
     with (tmp_path / "summary.csv").open() as file:
         read = list(csv.DictReader(file))
-    assert [row["mean_gap_policy"] for row in read] == ["12.5", "13.5", ""]
-    assert [row["theil_u_policy"] for row in read] == ["0.01", "0.01", ""]
+    assert [row["mean_gap"] for row in read] == ["12.5", "13.5", ""]
+    assert [row["theil_u"] for row in read] == ["0.01", "0.01", ""]
     out = io.StringIO()
-    shown = summary_table(table, metric_columns(list(statuses)))
-    Console(file=out, width=200, markup=False).print(shown)
+    Console(file=out, width=200, markup=False).print(summary.table())
     assert "mean gap [m]" in out.getvalue()
     assert "13.500" in out.getvalue()
     assert "Theil" not in out.getvalue()

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.figure import Figure
 
-from cfx.plugin import canvas, colours, headline, statistics, wording
+from cfx.plugin import MetricInfo, canvas, colours, headline, statistics, wording
 
 _ACROSS = 3
 _MOST = 6
@@ -17,13 +17,16 @@ _MOST = 6
 
 @canvas.styled
 def draw_models(
-    errors: Mapping[str, pd.DataFrame], compared: Sequence[statistics.Against]
+    errors: Mapping[str, pd.DataFrame],
+    compared: Sequence[statistics.Against],
+    judge: MetricInfo,
 ) -> Figure:
     """Draws a panel per other job: a dot per pair; above the line the best job is closer.
 
     Args:
-        errors: as `cfx.evaluation.statistics.ranking_of` takes them.
-        compared: as it returns them in `against`; at least one.
+        errors: of each job a row per pair: `pair_id`, `frames` and `error`.
+        compared: as `cfx.evaluation.statistics.ranking_of` returns them in `against`; at least one.
+        judge: the error by which they are compared.
     """
     shown = compared[:_MOST]
     across = min(canvas.most_across(_ACROSS), len(shown))
@@ -48,8 +51,9 @@ def draw_models(
         if note:
             lead += f"; {note}"
         axes.set_title(f"{one.best} over {one.other}\n{lead}")
-        axes.set_xlabel(canvas.wrapped(f"RMSE of speed of {one.best} (m/s)"))
-        axes.set_ylabel(canvas.wrapped(f"RMSE of speed of {one.other} (m/s)"))
+        unit = f" ({judge.unit})" if judge.unit else ""
+        axes.set_xlabel(canvas.wrapped(f"{judge.heading}, {one.best}{unit}"))
+        axes.set_ylabel(canvas.wrapped(f"{judge.heading}, {one.other}{unit}"))
     for unused in grid.flat[len(shown) :]:
         unused.set_visible(False)
     return figure

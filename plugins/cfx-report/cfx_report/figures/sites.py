@@ -80,7 +80,7 @@ def _panel(axes: Axes, rows: pd.DataFrame, baseline: str, names: list[tuple[str,
             color=colours.INK,
         )
     axes.axvline(0, color=colours.INK, linewidth=0.9)
-    axes.set_xlabel("improvement of the RMSE of speed, 95 % interval")
+    axes.set_xlabel("improvement, 95 % interval")
     axes.xaxis.set_major_formatter(FuncFormatter(canvas.percent_tick))
     axes.set_ylim(-0.8, len(names) - 0.4)
     axes.grid(visible=False, axis="y")

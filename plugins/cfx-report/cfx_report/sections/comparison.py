@@ -18,10 +18,18 @@ from cfx_report.jobs import (
     any_baselines,
     any_has_metric,
     are_calibrations,
+    judge_of,
     metric_title,
     of_purpose,
 )
-from cfx_report.names import Row, any_adapts, baselines_of, methods_of, rows_over_seeds
+from cfx_report.names import (
+    Row,
+    any_adapts,
+    baselines_of,
+    comparison_of,
+    methods_of,
+    rows_over_seeds,
+)
 from cfx_report.section import (
     Cell,
     Column,
@@ -85,6 +93,12 @@ _GAINS = (
 
 _JOB = Column[Result]("Job", lambda job: job.name)
 
+_RANKED = (
+    "Jobs are sorted by the error of the method that each is judged by (the policy; of a"
+    " calibration driver-specific parameters), the smallest first, which is bold. Jobs that were"
+    " tested on other pairs or frames do not compare and come last."
+)
+
 
 class ComparisonSection(Section):
     """All jobs side by side: how close each is to the real drivers, and how safely it drives."""
@@ -95,10 +109,10 @@ class ComparisonSection(Section):
     template = """
 <p>Errors in m/s and m compare across driving models{{ " and learners" if adapts }}; lower is closer
 to the real driver.
-{% if runs.jobs | length > 1 %}
-The best of a column is bold where all jobs are tested on the same pairs.
-{% endif %}
 </p>
+{% if runs.jobs | length > 1 %}
+<p>{{ ranked }}</p>
+{% endif %}
 {{ table(closeness, compact=true, explain=true) }}
 {% if unconditional %}
 <p class="note">{{ unconditional }}: the policy sets the acceleration itself. With constant
@@ -125,6 +139,7 @@ upper reference for the models that follow.</p>
         return {
             "adapts": adapts,
             "numbers": f"The numbers are {whose}",
+            "ranked": " ".join([_RANKED, *comparison_of(jobs).sentences()]),
             "closeness": closeness(jobs),
             "unconditional": job_names(of_purpose(jobs, Purpose.POLICY)),
             "errors": absolute(jobs),
@@ -139,9 +154,12 @@ def closeness(jobs: Sequence[Result]) -> Sheet:
         wording.TEST: tested(jobs),
         wording.FULL_TRAJECTORY: "the full trajectory of unseen drivers, from its first frame on",
     }
-    columns = [_JOB]
+    judge = judge_of(jobs)
+    other = "rmse_gap" if judge.name == "rmse_speed" else "rmse_speed"
+    below = "the RMSE of the gap in m" if other == "rmse_gap" else "the RMSE of speed in m/s"
+    jobs, columns = _by_error(jobs), [_JOB]
     for scope, group in (
-        (wording.TEST, "Test part: RMSE of speed in m/s, below it of gap in m"),
+        (wording.TEST, f"Test part: {metric_title(judge)}, below it {below}"),
         (wording.FULL_TRAJECTORY, "Full trajectories: the same"),
     ):
         for method in METHODS:
@@ -149,21 +167,34 @@ def closeness(jobs: Sequence[Result]) -> Sheet:
             for job in jobs:
                 if method in job.shown_methods:
                     showing.append(job)
-            if any_has_metric(showing, "rmse_speed", method, scope):
-                meaning = f"RMSE over {frames[scope]}, with {wording.explained(method)}."
-                cell = partial(_error, scope=scope, method=method)
+            if any_has_metric(showing, judge.name, method, scope):
+                meaning = f"Error over {frames[scope]}, with {wording.explained(method)}."
+                cell = partial(_error, metrics=(judge.name, other), scope=scope, method=method)
                 columns.append(Column(wording.short_label(method), cell, meaning, group))
     for baseline, scope in _GAINS:
         if baseline in any_baselines(jobs, scope):
             suffix = "" if scope == wording.TEST else ", full"
             meaning = (
-                f"Mean improvement of the RMSE of speed over {wording.explained(baseline)}, on"
-                f" {frames[scope]}; below it the 95 % interval."
+                f"Improvement over {wording.explained(baseline)}, on {frames[scope]}, geometric"
+                " over drivers; below it the 95 % interval."
             )
             heading = f"over {wording.short_label(baseline)}{suffix}"
             cell = partial(_gain, baseline=baseline, scope=scope)
             columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
     return _with_best(Sheet.of(columns, jobs), jobs)
+
+
+def _by_error(jobs: Sequence[Result]) -> list[Result]:
+    """Returns the jobs that were tested on the same frames, the smallest error first; then others.
+
+    The error is that of the method that a job is judged by, the mean over seeds.
+    """
+    places: dict[str, int] = {}
+    ranked = comparison_of(jobs).ranking.jobs
+    for row in rows_over_seeds(jobs):
+        for job in row.jobs:
+            places[job.name] = ranked.index(row.name) if row.name in ranked else len(ranked)
+    return sorted(jobs, key=lambda job: places[job.name])
 
 
 def safety(jobs: Sequence[Result]) -> Sheet:
@@ -208,7 +239,7 @@ def absolute(jobs: Sequence[Result]) -> dict[str, View]:
     for metric, scope in _ERRORS:
         if not any(job.has_metric(metric, job.judged, scope) for job in jobs):
             continue
-        signal, unit = ("speed", "m/s") if metric == "rmse_speed" else ("gap", "m")
+        signal, unit = ("speed", "m/s") if metric == "rmse_speed" else ("the gap", "m")
         values = {}
         for method in METHODS:
             errors = np.array([_shown_error(job, metric, method, scope) for job in jobs])
@@ -226,12 +257,14 @@ def _shown_error(job: Result, metric: str, method: str, scope: str) -> float:
     return job.metric(metric, method, scope) if method in job.shown_methods else math.nan
 
 
-def _error(job: Result, scope: str, method: str) -> Cell:
-    if not (method in job.shown_methods and job.has_metric("rmse_speed", method, scope)):
+def _error(job: Result, metrics: tuple[str, str], scope: str, method: str) -> Cell:
+    """Returns an error of a method, and below it another one."""
+    first, other = metrics
+    if not (method in job.shown_methods and job.has_metric(first, method, scope)):
         return number(math.nan, "")
-    gap = job.metric("rmse_gap", method, scope)
-    second = formatted(gap, ".2f") if math.isfinite(gap) else ""
-    return number(job.metric("rmse_speed", method, scope), ".3f", second)
+    beside = job.metric(other, method, scope)
+    second = formatted(beside, ".2f") if math.isfinite(beside) else ""
+    return number(job.metric(first, method, scope), ".3f", second)
 
 
 def _gain(job: Result, baseline: str, scope: str) -> Cell:
@@ -256,22 +289,16 @@ def _with_baseline(job: Result, metric: str, scope: str, baseline: str, form: st
 
 
 def _with_best(sheet: Sheet, jobs: Sequence[Result]) -> Sheet:
-    """Marks the policy's smallest error and largest improvement, if all are tested on the same."""
-    tests = set()
-    for job in jobs:
-        fingerprint = str(job.data.get("fingerprint"))
-        tests.add((fingerprint, frozenset(job.pairs["pair_id"]), job.split))
-    if len(jobs) < 2 or len(tests) > 1:
+    """Marks the smallest error of the methods that jobs are judged by, where jobs are ranked."""
+    if len(jobs) < 2 or not comparison_of(jobs).ranking.against:
         return sheet
-    rows = [list(row) for row in sheet.rows]
-    for k, column in enumerate(sheet.columns):
-        is_error = column.heading == "policy"
-        known = [float(row[k].sort) for row in rows if row[k].sort]
-        if known and (is_error or column.heading.startswith("over ")):
-            best = min(known) if is_error else max(known)
-            for row in rows:
-                row[k] = replace(row[k], best=row[k].sort == repr(best))
-    return replace(sheet, rows=tuple(map(tuple, rows)))
+    best = wording.short_label(jobs[0].judged)
+    cells = list(sheet.rows[0])
+    for place, column in enumerate(sheet.columns):
+        if column.heading == best:  # of the test part, which stands before full trajectories
+            cells[place] = replace(cells[place], best=True)
+            break
+    return replace(sheet, rows=(tuple(cells), *sheet.rows[1:]))
 
 
 class SeedsSection(Section):
@@ -303,15 +330,14 @@ def over_seeds(rows: Sequence[Row]) -> Sheet:
         ),
         Column("Seeds", lambda row: number(len(row.jobs), "d"), "Jobs of the row."),
     ]
-    errors = "Test part: RMSE of speed in m/s"
+    judge = judge_of(chain.from_iterable(row.jobs for row in rows))
+    errors = f"Test part: {metric_title(judge)}"
     for method in methods_of(rows):
-        meaning = f"RMSE of speed over {where}, with {wording.explained(method)}."
-        cell = partial(_error_over_seeds, method=method)
+        meaning = f"{judge.heading} over {where}, with {wording.explained(method)}."
+        cell = partial(_error_over_seeds, metric=judge.name, method=method)
         columns.append(Column(wording.short_label(method), cell, meaning, errors))
     for baseline in baselines_of(rows):
-        meaning = (
-            f"Mean improvement of the RMSE of speed over {wording.explained(baseline)}, test part."
-        )
+        meaning = f"Improvement over {wording.explained(baseline)}, test part, geometric."
         heading, cell = (
             f"over {wording.short_label(baseline)}",
             partial(_gain_over_seeds, baseline=baseline),
@@ -320,11 +346,11 @@ def over_seeds(rows: Sequence[Row]) -> Sheet:
     return Sheet.of(columns, rows)
 
 
-def _error_over_seeds(row: Row, method: str) -> Cell:
+def _error_over_seeds(row: Row, metric: str, method: str) -> Cell:
     """Returns a method's mean error and its range; empty where its jobs have no such method."""
     if method == "policy" and not any_adapts([row]):
         return number(np.nan, "")
-    return _mean_and_range(row.values("rmse_speed", method), ".3f")
+    return _mean_and_range(row.values(metric, method), ".3f")
 
 
 def _gain_over_seeds(row: Row, baseline: str) -> Cell:

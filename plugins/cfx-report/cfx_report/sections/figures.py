@@ -17,7 +17,7 @@ from cfx.plugin import (
     wording,
 )
 from cfx_report.figures.history import history_curves
-from cfx_report.jobs import Runs, are_calibrations, of_purpose
+from cfx_report.jobs import Runs, are_calibrations, metric_title, of_purpose
 from cfx_report.section import MOST, Column, Section, Sheet, View, interval, job_names, number
 
 
@@ -223,7 +223,7 @@ The pair that improves most over driver-specific calibration, the one in the mid
 improves least, on the test part.
 {% endif %}
 {% if constant %}
-Of a calibration: the pairs with the least, the median and the largest RMSE of speed.
+Of a calibration: the pairs with the least, the median and the largest error.
 {% endif %}
 What lies outside a parameter's bounds is shaded.
 </p>
@@ -262,7 +262,7 @@ def chosen_pairs(job: Result) -> tuple[pair_lines.RankedPair, ...]:
     present = [trajectory.pair_id for trajectory in job.trajectories]
     table = job.by_pair[job.by_pair["pair_id"].isin(present)]
     if job.purpose is Purpose.CALIBRATION:
-        gains = -table[f"rmse_speed/{job.judged}"].to_numpy(dtype=float)
+        gains = -table[f"{job.judge.name}/{job.judged}"].to_numpy(dtype=float)
     else:
         gains = table["improvement/driver_specific"].to_numpy(dtype=float)
     return pair_lines.rank_pairs(table["pair_id"].astype(str).tolist(), gains)
@@ -285,5 +285,5 @@ def _errors_of_pair(job: Result, pair: pair_lines.RankedPair) -> str:
     row = job.by_pair.set_index("pair_id").loc[pair.pair_id]
     errors = []
     for method in job.shown_methods:
-        errors.append(f"{wording.short_label(method)} {row[f'rmse_speed/{method}']:.3f}")
-    return f"RMSE of speed (m/s): {', '.join(errors)}"
+        errors.append(f"{wording.short_label(method)} {row[f'{job.judge.name}/{method}']:.3f}")
+    return f"{metric_title(job.judge)}: {', '.join(errors)}"

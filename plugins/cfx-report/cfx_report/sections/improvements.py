@@ -98,7 +98,7 @@ def pairs_of(job: Result) -> Sheet:
         cell = partial(_value, f"improvement/{baseline}", form="+.1%")
         heading, meaning = (
             f"over {wording.short_label(baseline)}",
-            "Improvement of the RMSE of speed.",
+            f"Improvement of the {job.judge.heading}.",
         )
         columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
     errors = "RMSE of speed in m/s, below it of gap in m"
@@ -222,7 +222,7 @@ def clusters(series: Series, baseline: str) -> Sheet:
     for name, by_cluster in series.items():
         for cluster, table in by_cluster.items():
             # Jobs without this baseline may stand beside others that have it.
-            if f"rmse_speed/{baseline}" in table:
+            if f"improvement/{baseline}" in table:
                 rows.append(_Row(name, cluster, improvement_of(table, baseline)))
     columns: tuple[Column[_Row], ...] = (
         Column("Jobs", lambda row: row.jobs),
@@ -254,6 +254,8 @@ def improvement_of(table: pd.DataFrame, baseline: str) -> Improvement:
     """
     from cfx.plugin import statistics  # imports scipy
 
-    before = table[f"rmse_speed/{baseline}"].to_numpy(dtype=float)
-    after = table["rmse_speed/policy"].to_numpy(dtype=float)
-    return statistics.improvement_statistics(before, after, table["driver"].astype(str).tolist())
+    # Errors relative to the baseline's: of each job those of the metric that it is judged by.
+    after = 1.0 - table[f"improvement/{baseline}"].to_numpy(dtype=float)
+    return statistics.improvement_statistics(
+        np.ones_like(after), after, table["driver"].astype(str).tolist()
+    )

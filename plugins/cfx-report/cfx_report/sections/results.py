@@ -10,7 +10,14 @@ from typing import Any, NamedTuple
 
 from cfx.plugin import OUTSIDE, SCOPES, Improvement, MetricInfo, Purpose, Result, wording
 from cfx_report.figures.jobs import draw_overview, statistics_axis
-from cfx_report.jobs import Runs, any_baselines, are_calibrations, metric_title, of_purpose
+from cfx_report.jobs import (
+    Runs,
+    any_baselines,
+    are_calibrations,
+    judge_of,
+    metric_title,
+    of_purpose,
+)
 from cfx_report.section import (
     Cell,
     Column,
@@ -34,9 +41,9 @@ class ResultsSection(Section):
     template = """
 {% if compared %}
 <h3>How much closer the policy drives</h3>
-<p>Mean improvement of the RMSE of speed over each baseline, with its 95 % interval. Where the
-interval contains 0, the job does not tell whether the policy helps.</p>
-{{ figure(overview, "Mean improvement of each job with its 95 % interval") }}
+<p>Improvement of {{ error }} over each baseline, geometric over drivers, with its 95 % interval.
+Where the interval contains 0, the job does not tell whether the policy helps.</p>
+{{ figure(overview, "Improvement of each job with its 95 % interval") }}
 {{ table(improvements, explain=true) }}
 {% endif %}
 <h3>Errors of each method</h3>
@@ -48,6 +55,7 @@ interval contains 0, the job does not tell whether the policy helps.</p>
         jobs = runs.jobs
         return {
             "compared": of_purpose(jobs, Purpose.ADAPTATION),
+            "error": f"the {judge_of(jobs).heading}",
             "overview": overview(jobs),
             "improvements": improvements(jobs),
             "errors": errors(jobs),
@@ -55,7 +63,7 @@ interval contains 0, the job does not tell whether the policy helps.</p>
 
 
 def overview(jobs: Sequence[Result]) -> dict[str, View]:
-    """Mean improvement with its 95 % interval; a view per baseline and part of the trajectories."""
+    """Improvement with its 95 % interval; a view per baseline and part of the trajectories."""
     views = {}
     for scope in SCOPES:
         suffix = "" if scope == wording.TEST else f", {jobs[0].scope_label(scope)}"
@@ -86,6 +94,10 @@ def errors(jobs: Sequence[Result]) -> Sheet:
     for job in jobs:
         methods += job.methods
         rows += [_Tested(job, method) for method in job.shown_methods]
+    judge, leading = judge_of(jobs), []
+    if judge.name not in {"rmse_speed", "rmse_gap"}:
+        cell = partial(_metric, judge.name)
+        leading.append(Column[_Tested](metric_title(judge), cell, f"{judge.meaning}."))
     columns = [
         Column[_Tested]("Job", lambda row: row.job.name),
         Column("Method", lambda row: method_cell(row.method), methods_explained(methods)),
@@ -94,6 +106,7 @@ def errors(jobs: Sequence[Result]) -> Sheet:
             lambda row: number(row.pairs, "d"),
             "Pairs of a leader and a follower; the means are taken over them.",
         ),
+        *leading,
         Column(
             "RMSE of speed (m/s)",
             partial(_metric, "rmse_speed"),
