@@ -34,13 +34,18 @@ MODULES = {
     "parameter_spread": "cfx.results.figures.parameter_spread",
     "regimes": "cfx.models.regimes",
     "registry": "cfx.core.registry",
+    "roads": "cfx.evaluation.roads",
     "statements": "cfx.data.statements",
     "statistics": "cfx.evaluation.statistics",
+    "steady": "cfx.data.steady",
     "storage": "cfx.core.storage",
     "style": "cfx.data.style",
     "threads": "cfx.core.threads",
     "tracks": "cfx.data.tracks",
+    "traffic": "cfx.evaluation.traffic",
+    "traffic_table": "cfx.policies.ready.traffic_table",
     "valid_range": "cfx.policies.valid_range",
+    "waves": "cfx.evaluation.waves",
     "wording": "cfx.figures.wording",
 }
 """The names that are modules: `lazy_loader` finds attributes of modules alone."""

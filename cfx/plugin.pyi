@@ -21,7 +21,13 @@ from .core.parameters import (
 )
 
 # Datasets: pairs, tables with declared columns, tracks and their pairs, driving style
-from .data import names as names, statements as statements, style as style, tracks as tracks
+from .data import (
+    names as names,
+    statements as statements,
+    steady as steady,
+    style as style,
+    tracks as tracks,
+)
 from .data.base import (
     Contents as Contents,
     Dataset as Dataset,
@@ -144,13 +150,14 @@ from .policies.features import (
 from .policies.heads.base import DirectHead as DirectHead, ParameterHead as ParameterHead
 from .policies.heads.stochastic import NOISE_SCALE as NOISE_SCALE, StochasticHead as StochasticHead
 from .policies.history import History as History, measured_history as measured_history
+from .policies.population import DriverPopulation as DriverPopulation
 from .policies.inputs import require_no_further_signals as require_no_further_signals
 from .policies.inputs.base import PolicyInput as PolicyInput
 from .policies.known_drivers import (
     base_of as base_of,
     driver_features_of as driver_features_of,
 )
-from .policies.ready import READY_FOLDER as READY_FOLDER
+from .policies.ready import READY_FOLDER as READY_FOLDER, traffic_table as traffic_table
 
 # Learners
 from .learners import curves as curves
@@ -161,7 +168,14 @@ from .learners.base import (
 )
 
 # Evaluation: protocols, metrics, forecasts, statistics, demonstrations
-from .evaluation import forecasts as forecasts, headline as headline, statistics as statistics
+from .evaluation import (
+    forecasts as forecasts,
+    headline as headline,
+    roads as roads,
+    statistics as statistics,
+    traffic as traffic,
+    waves as waves,
+)
 from .evaluation.closed_loop import Followers as Followers, burnt_in as burnt_in
 from .evaluation.demo import DEMO_PAGE as DEMO_PAGE, Demo as Demo
 from .evaluation.metrics.base import (

@@ -99,7 +99,7 @@ def test_one_pair_has_its_table_and_its_speed_plots(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Figure, "savefig", lambda figure, file, **options: file.touch())
-    few = ["data.frames=120", "tracking.enabled=false", "figures=own"]
+    few = ["data.frames=120", "tracking.enabled=false", "figures=[own,speeds]"]
     result = cfx.run(["experiment=paper/pair", *SMALL, *few])
     assert result.pairs.method.tolist() == ["default", "driver_specific", "policy"]
     assert "speeds.png" in {path.name for path in result.figures}

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from cfx.api.pairs import Pairs, PairsLike, pairs_from
 from cfx.app.job.run import compute
@@ -24,7 +24,16 @@ from cfx.results.folder import read_config
 from cfx.results.result import Result
 from cfx.results.tracker import folder_of
 
-PolicyLike = Result | Agent | str | Path
+
+class HasPolicy(Protocol):
+    """What has a policy in memory: a fit, whose policy is its pooled parameters."""
+
+    @property
+    def policy(self) -> Agent:
+        """The policy, ready for another trajectory."""
+
+
+PolicyLike = HasPolicy | Result | Agent | str | Path
 """A policy: a result that has one, the policy itself, a job's folder, or `cfx://NAME`."""
 
 M = TypeVar("M", bound=DrivingModel)
@@ -162,7 +171,8 @@ def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings:
     with each driver's own, calibrated on the first part of their trajectory here.
 
     Args:
-        policy: what `cfx.train` or `cfx.load` returned, a job's folder, or `cfx://NAME`.
+        policy: what `cfx.train`, `cfx.calibrate` or `cfx.load` returned, a job's folder, or
+            `cfx://NAME`. Of a fit its pooled parameters drive, the same for every driver.
         pairs: as `cfx.read` takes them; pairs that the policy learned from are refused.
         seed: of calibration and of intervals.
         settings: others of the command line: `protocol="forecast"`, `optimizer="random"`.
@@ -213,7 +223,7 @@ def in_folder(policy: PolicyLike) -> Iterator[str]:
         folder_of(policy)  # says that it is not there
         yield str(policy)
         return
-    agent = policy.policy if isinstance(policy, Result) else policy
+    agent = policy if isinstance(policy, Agent) else policy.policy
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(temporary, IN_MEMORY)
         checkpoint.save_agent(agent, folder / "policy")

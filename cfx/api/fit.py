@@ -6,28 +6,41 @@ Shapes: P pairs, n tuned parameters.
 from __future__ import annotations
 
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
 
 from cfx.api.experiment import Experiment, config
-from cfx.api.pairs import Pairs, PairsLike, pairs_from
+from cfx.api.pairs import PairIds, Pairs, PairsLike, chosen_names, pairs_from, read
+from cfx.core.files import atomic_write
 from cfx.core.guest import visit
-from cfx.errors import ConfigError
+from cfx.data.tidy import write_tidy
+from cfx.errors import ConfigError, DataError
+from cfx.evaluation.headline import FEW_DRIVERS
+from cfx.results.comparison import Comparison
+from cfx.results.result import Result
 
 if TYPE_CHECKING:
     import torch
     from matplotlib.figure import Figure
     from torch import Tensor
 
+    from cfx.app.job.steps import JobComponents
     from cfx.calibration.posterior import DriverPosteriors
     from cfx.evaluation.protocols.base import ProtocolContext
+    from cfx.policies.agent import Agent
 
 METHODS = ("default", "pooled", "driver_specific")
 """What is compared: the model's defaults, pooled and driver-specific parameters."""
+
+_RECORDING, _PARAMETERS = "recording.parquet", "parameters.parquet"
+"""Files of a saved fit besides those of a job."""
+
+_TITLES = {"rmse_speed": "RMSE of speed, m/s", "rmse_gap": "RMSE of gap, m"}
 
 _AT_BOUND = 0.01
 """So near to a bound, as a share of the distance between both, a value is at it."""
@@ -39,12 +52,12 @@ class Fit:
 
     Attributes:
         experiment: the configuration, with the command that repeats it.
-        pairs: what was calibrated on.
+        recorded: what was calibrated on.
         parameters: a row per pair: the driver's own parameters, SI units.
     """
 
     experiment: Experiment
-    pairs: Pairs
+    recorded: Pairs
     parameters: pd.DataFrame
     _context: ProtocolContext = field(compare=False)
     _last: torch.Tensor = field(compare=False)
@@ -61,13 +74,14 @@ class Fit:
 
     @cached_property
     def pooled(self) -> pd.Series:
-        """One set of parameters for all drivers, SI units: it minimises the mean of their losses.
+        """One set of parameters for all these drivers, SI units, pooled over themselves.
 
-        It is calibrated on the same frames when it is first asked for.
+        It minimises the mean of their losses on the same frames as their own sets do; it is found
+        when it is first asked for. A job's `pooled` is calibrated on other drivers.
         """
         import torch
 
-        members = torch.ones((1, len(self.pairs)), dtype=torch.bool)
+        members = torch.ones((1, len(self._context.pairs)), dtype=torch.bool)
         context = self._context
         with visit():
             found = context.calibrator.pooled(context.pairs, context.batch, self._last, members)
@@ -78,6 +92,23 @@ class Fit:
         """The model's default parameters, SI units."""
         space = self._context.space
         return pd.Series({name: space[name].default for name in space.names}, name="default")
+
+    @cached_property
+    def policy(self) -> Agent:
+        """The pooled parameters as a policy that drives anybody: for `cfx.evaluate`, `forecast`."""
+        from cfx.policies.constant import FixedPolicy
+        from cfx.policies.core import ANY_DRIVER
+
+        context = self._context
+        with visit():
+            values = self._tensor("pooled")[:1]
+            agent = context.constant(FixedPolicy(), values)
+        return replace(agent, names=(ANY_DRIVER,), pooled=values.cpu())
+
+    @cached_property
+    def result(self) -> Result:
+        """The same calibration as a job: its trajectories, metrics, tables and figures."""
+        return self.experiment.run()
 
     @cached_property
     def losses(self) -> pd.DataFrame:
@@ -91,8 +122,9 @@ class Fit:
         with visit():
             return pd.concat([self._errors(method) for method in METHODS], ignore_index=True)
 
+    @cached_property
     def summary(self) -> pd.DataFrame:
-        """Returns a row per parameter: its unit, default, pooled value, and the drivers' spread.
+        """A row per parameter: its unit, default, pooled value, and the drivers' spread.
 
         Columns: unit, default, pooled, mean, std, 25%, 50%, 75%, at_bound (share of the pairs
         whose value is at a bound, where the recording does not determine it).
@@ -171,7 +203,30 @@ class Fit:
             method = posterior_method(settings.posterior)
             return method.find(solver, context.batch, self._last, own, settings)
 
-    def plot(self) -> Figure:
+    def plot(self, name: str = "parameters", pair_id: PairIds | None = None) -> Figure:
+        """Draws the fit.
+
+        Args:
+            name: `parameters`: between their bounds, and how they go together; `drives`: measured
+                against simulated speed and gap on the test part; or another figure of a job
+                (`cfx plugins list figure`), such as `fan` where a posterior was asked for.
+            pair_id: of `drives`: which pairs; None: the best, the median and the worst.
+
+        Raises:
+            DataError: there is no such figure, or nothing of what it shows.
+        """
+        if name == "parameters":
+            return self._plot_parameters()
+        if name == "drives" and pair_id is not None:
+            from cfx.figures.drawing import for_notebooks
+            from cfx.results.figures.pair_lines import drives
+
+            known = list(self.parameters.index)
+            chosen = chosen_names(pair_id, known, "the fit")
+            return for_notebooks(drives(self.result, chosen))
+        return self.result.plot(name)
+
+    def _plot_parameters(self) -> Figure:
         """Draws the parameters between their bounds, and how they go together."""
         from cfx.results.result import Result, described_parameters
 
@@ -179,6 +234,48 @@ class Fit:
         rows = pd.concat(tables, ignore_index=True)
         described = {"parameters": described_parameters(self._context.space.tuned)}
         return Result(data=described, tables={"pairs": rows}).plot("calibration")
+
+    def save(self, folder: str | Path) -> Path:
+        """Writes the folder of the calibration as a job, with the recording; MLflow is not told.
+
+        `cfx.load` reads it as a job, `cfx.Fit.load` as this fit.
+
+        Args:
+            folder: made if it is not there.
+
+        Raises:
+            OutputError: it cannot be written.
+        """
+        written = self.result.save(folder).folder
+        assert written is not None
+        with atomic_write(written / _RECORDING) as temporary:
+            write_tidy(self.recorded.selected, temporary)
+        with atomic_write(written / _PARAMETERS) as temporary:
+            self.parameters.to_parquet(temporary)
+        return written
+
+    @classmethod
+    def load(cls, folder: str | Path) -> Fit:
+        """Reads a fit that `save` has written.
+
+        Raises:
+            DataError: there is none.
+        """
+        place = Path(folder)
+        if not (place / _PARAMETERS).is_file():
+            raise DataError(
+                f"{place} holds no fit (it has no {_PARAMETERS}); Fit.save writes one, and cfx.load"
+                " reads any other calibration"
+            )
+        from cfx.api.experiment import from_config
+
+        recording = read(place / _RECORDING)
+        experiment = replace(from_config(place), pairs=recording)
+        parameters = pd.read_parquet(place / _PARAMETERS)
+        with visit():
+            components, context, last = _context_of(experiment, recording)
+            components.engine.close()
+        return cls(experiment, recording, parameters, context, last)
 
     def _of(self, method: str) -> pd.DataFrame:
         """Returns a method's parameters, a row per pair."""
@@ -227,21 +324,29 @@ class Fit:
         return pd.DataFrame(errors)
 
     def __repr__(self) -> str:
-        from cfx.figures.wording import short_label
+        from cfx.figures.wording import plural, short_label
 
-        part = "test" if self._context.split < 1 else "train"
-        found = self.losses.groupby("method")[f"{part}_rmse_speed"].mean()
-        where = "the test part" if part == "test" else "what was calibrated on"
-        means = [f"{short_label(method)} {found[method]:.3f}" for method in METHODS]
-        return (
-            f"Fit({self.model}, {len(self.parameters)} pairs; RMSE of speed on {where}, m/s:"
-            f" {', '.join(means)})"
-        )
+        context = self._context
+        judge = context.calibrator.solver.objective.metric or "rmse_speed"
+        part, where = ("test", "the test part") if context.split < 1 else ("train", "all of it")
+        lines = []
+        for metric in dict.fromkeys((judge, "rmse_speed", "rmse_gap")):
+            name = f"{part}_{metric}"
+            if name in self.losses:
+                means = self.losses.groupby("method")[name].mean()
+                said = [f"{short_label(method)} {means[method]:.3f}" for method in METHODS]
+                lines.append(f"{_TITLES[metric]}: {', '.join(said)}")
+        few = self.losses["driver"].nunique()
+        about = plural(len(self.parameters), "pair")
+        if few < FEW_DRIVERS:
+            about += f" of only {plural(few, 'driver')}"
+        pooled = "pooled over these drivers, on what was calibrated on"
+        return f"Fit({self.model}, {about}; on {where}, {pooled};\n  " + ";\n  ".join(lines) + ")"
 
     def _repr_html_(self) -> str:
         from cfx.figures.drawing import as_html
 
-        return as_html(repr(self), self.summary())
+        return as_html(repr(self), self.summary)
 
 
 def _ask_for(posterior: str) -> str:
@@ -288,13 +393,63 @@ def calibrate(
     recording = pairs_from(pairs)
     experiment = config(recording, policy="fixed", protocol="within_driver", **chosen)
     with visit():
-        from cfx.app.job import steps
-        from cfx.simulation.windows import Split
-
-        _, components, context = steps.without_files(experiment.config, recording.selected)
+        components, context, last = _context_of(experiment, recording)
         with closing(components.engine):
-            last = Split.of(context.pairs, context.windows, context.split).frame
             found = context.calibrator.driver_specific(context.pairs, context.batch, last)
     ids = pd.Index(context.pairs.ids, name="pair_id")
     table = pd.DataFrame(found.cpu().numpy(), ids, list(context.space.names))
     return Fit(experiment, recording, table, context, last)
+
+
+def _context_of(
+    experiment: Experiment, recording: Pairs
+) -> tuple[JobComponents, ProtocolContext, Tensor]:
+    """Returns what a calibration works with, and the last frame of each pair that it is on."""
+    from cfx.app.job import steps
+    from cfx.simulation.windows import Split
+
+    _, components, context = steps.without_files(experiment.config, recording.selected)
+    last = Split.of(context.pairs, context.windows, context.split).frame
+    return components, context, last
+
+
+def compare(*jobs: Fit | Result, **named: Fit | Result) -> Comparison:
+    """Compares fits and jobs: which is closest to the drivers, and is it chance.
+
+    Each is judged by its policy, a fit and a calibration by the drivers' own parameters, on the
+    test part. Only those that were tested on the same frames of the same pairs are ranked.
+
+    Args:
+        jobs: what `cfx.calibrate`, `cfx.train`, `cfx.evaluate` or `cfx.load` returned; they are
+            called by their model and policy.
+        named: the same under names of your choice.
+
+    Returns:
+        Printed, a table, the smallest error first, and the verdict in one sentence, which holds its
+        level over all comparisons (Holm); `table` is a data frame.
+
+    Raises:
+        ConfigError: fewer than two are given.
+
+    Examples:
+        >>> import cfx
+        >>> pairs = cfx.read(dataset="synthetic", pairs=4, frames=300)
+        >>> fits = [cfx.calibrate(pairs, model) for model in ("idm", "krauss")]
+        >>> sorted(cfx.compare(*fits).table.index)
+        ['idm', 'krauss']
+    """
+    if len(jobs) + len(named) < 2:
+        raise ConfigError("compare: give two fits or results, or more")
+    results: dict[str, Result] = {}
+    for job in jobs:
+        result = job.result if isinstance(job, Fit) else job
+        parts = [result.component("model")]
+        if isinstance(job, Result):
+            parts.append(result.component("policy"))
+        name = " ".join(part for part in parts if part) or f"job {len(results) + 1}"
+        while name in results:
+            name += "'"
+        results[name] = result
+    for name, job in named.items():
+        results[name] = job.result if isinstance(job, Fit) else job
+    return Comparison.of({name: [result] for name, result in results.items()})

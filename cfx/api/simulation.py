@@ -64,8 +64,8 @@ def simulate(
     Args:
         model: as after `model=`.
         parameters: a `Fit` (each driver's own), a mapping or a series of values by name for all
-            followers, or a frame with a row for each, whose index are pair ids; SI units. What is
-            left out is at its default; None: all is.
+            followers, or a frame with a row for each, whose index or column `pair_id` has the
+            pairs' ids; SI units. What is left out is at its default; None: all is.
         pairs: recorded leaders and the followers' starts, as `cfx.read` takes them.
         leader: in place of `pairs`: a leader's speed over time, as columns `time_s` and `speed`
             (m/s), or as a series of it whose index is the time. The step must be constant.
@@ -153,7 +153,7 @@ def _recording(
     if gap is not None or speed is not None:
         raise ConfigError("gap and speed say where a follower of leader=... starts; give a leader")
     if pairs is None and isinstance(parameters, Fit):
-        return parameters.pairs.selected
+        return parameters.recorded.selected
     if pairs is None:
         raise ConfigError("give recorded pairs, or leader=FRAME with columns time_s and speed")
     return pairs_from(pairs).selected
@@ -216,6 +216,8 @@ def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict
     if isinstance(parameters, Fit):
         parameters = parameters.parameters
     if isinstance(parameters, pd.DataFrame):
+        if "pair_id" in parameters:
+            parameters = parameters.set_index("pair_id")
         names = names_of(parameters.index)
         twice = named_twice(names)
         if twice is not None:

@@ -23,11 +23,12 @@ from cfx.core.storage import is_url, local_copies
 from cfx.data.accelerations import Accelerations, with_usable_accelerations
 from cfx.data.check import Check, check_pairs
 from cfx.data.files import FileStart, recording_of, stem
+from cfx.data.known import with_known_types, with_names
 from cfx.data.names import Name
 from cfx.data.pairs import Dropped, Pair, PairSet, Remark, driver_names, of_each
 from cfx.data.resampling import resampled, scaled
 from cfx.data.signals import RECORDED
-from cfx.data.sites import SiteNames, VehiclePattern, with_sites, with_vehicles
+from cfx.data.sites import SiteNames, VehiclePattern
 from cfx.data.tracks import totals_by_reason
 from cfx.errors import DataError, PluginError, listed, nearest
 
@@ -94,12 +95,14 @@ class DatasetSettings(Settings):
         None,
         description="the road or area of the recordings: one name for all, or names by patterns of"
         " recordings or files, such as {i80-*: I-80}; null: what the source says, or else, where"
-        " several files are read, the file's name",
+        " several files are read, the road of a public recording that is known by its name, or the"
+        " file's name",
     )
     vehicle: VehiclePattern | None = Field(
         None,
         description="a regular expression whose group finds, in a follower's id, the name that its"
-        " vehicle keeps over recordings, such as '^[0-9]+-(.+)$'; null: what the source says",
+        " vehicle keeps over recordings, such as '^[0-9]+-(.+)$'; null: what the source says, or"
+        " what is known of a public recording",
     )
     lanes: Distinct[list[int] | None] = Field(
         None, description="keep pairs in these lanes alone; null: all"
@@ -110,7 +113,7 @@ class DatasetSettings(Settings):
     driver_type: Name | None = Field(
         None,
         description="keep followers of this type alone, as the recording labels them: human, acc,"
-        " automated, truck, a vType; null: all",
+        " automated, truck, a vType; NGSIM's are human; null: all",
     )
     leader_driver_type: Name | None = Field(
         None, description="keep pairs behind leaders of this type alone; null: all"
@@ -270,8 +273,9 @@ class Dataset(Component):
             if reasons:
                 why = f" (left out: {'; '.join(reasons)})"
             raise DataError(f"{pairs.source}: no leader-follower pair found{why}")
-        pairs = with_sites(pairs, self.settings.site)
-        pairs = with_vehicles(pairs, self.settings.vehicle)
+        pairs = with_names(pairs, self.settings.site, self.settings.vehicle)
+        if self.settings.driver_type is not None or self.settings.leader_driver_type is not None:
+            pairs = with_known_types(pairs)
         for name in _NOUNS:
             pairs = _selected(pairs, name, getattr(self.settings, name))
         recorded = dict(zip(of_each(pairs, "pair_id"), pairs, strict=True))

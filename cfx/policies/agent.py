@@ -31,6 +31,7 @@ from cfx.policies.context import UNSEEN, ContextRule, DriverContext, ExpectedErr
 from cfx.policies.core import ANY_DRIVER, AgentCore, driver_places
 from cfx.policies.heads.offset import blended
 from cfx.policies.history import History, measured_history
+from cfx.policies.population import DriverPopulation
 from cfx.policies.valid_range import RANGE_SIGNALS, ValidRange, situation_of, weight_of_answer
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import WindowSettings
@@ -93,11 +94,14 @@ class TrainedOn:
         quantiles: 5, 50 and 95 % of speed (m/s), acceleration (m/s2) and time gap (s) of the
             drivers; empty if they are not known.
         expected_error: how large errors were on left-out drivers; None if that was not measured.
+        drivers: features of the drivers, of whom vehicles of a fleet draw theirs; None for a policy
+            that reads none.
     """
 
     pairs: Mapping[str, str] = field(default_factory=dict)
     quantiles: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     expected_error: ExpectedError | None = None
+    drivers: DriverPopulation | None = None
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,7 @@ from cfx.policies.core import AgentCore, features_read, network_with_weights
 from cfx.policies.features import Scaler
 from cfx.policies.heads import head_class
 from cfx.policies.heads.base import ParameterHead
+from cfx.policies.population import DriverPopulation
 from cfx.policies.valid_range import RANGE_SIGNALS, ValidRange
 from cfx.simulation.windows import WindowSettings
 
@@ -38,6 +39,9 @@ _TENSORS = "policy.safetensors"
 
 _RANGE = "valid_range."
 """Prefix of the names of the valid range's tensors."""
+
+_DRIVERS = "drivers."
+"""Prefix of the names of the tensors of the drivers that were learned from."""
 
 
 def save_agent(agent: Agent, folder: Path) -> None:
@@ -173,6 +177,13 @@ def _agent(
     tensors_of_range = _named(weights, _RANGE)
     if tensors_of_range:
         valid_range = ValidRange(**tensors_of_range)
+    drivers = None
+    tensors_of_drivers = _named(weights, _DRIVERS)
+    if tensors_of_drivers:
+        drivers = DriverPopulation(**tensors_of_drivers)
+        count = len(drivers.weight)
+        if drivers.features.shape != (count, len(policy.driver_features)):
+            raise ValueError(f"'{_DRIVERS}features' has the shape {tuple(drivers.features.shape)}")
     trained = _named(weights, "network.")
     network = network_with_weights(policy, trained, description.ensemble_size, scaler, head.answers)
     return Agent(
@@ -191,7 +202,7 @@ def _agent(
         ),
         pooled=weights.get("pooled"),
         trained_on=TrainedOn(
-            description.learned_from, description.recorded, description.expected_error
+            description.learned_from, description.recorded, description.expected_error, drivers
         ),
         valid_range=valid_range,
         dispersion=weights.get("dispersion"),
@@ -211,6 +222,9 @@ def _tensors(agent: Agent) -> dict[str, Tensor]:
     if agent.valid_range is not None:
         for name, value in agent.valid_range._asdict().items():
             tensors[f"{_RANGE}{name}"] = value.cpu()
+    if agent.trained_on.drivers is not None:
+        for name, value in agent.trained_on.drivers._asdict().items():
+            tensors[f"{_DRIVERS}{name}"] = value.cpu()
     return tensors
 
 

@@ -135,9 +135,9 @@ class JobNodes(Settings):
 
     figures: Literal["none"] | Chosen = Field(
         "own",
-        description="which figures are drawn: own: cfx's own, and those of the plugins whose"
-        " components the job has; all: all that are installed; none; or a list of names, in which"
-        " own may stand",
+        description="which figures are drawn: own: the usual ones of cfx, and those of the plugins"
+        " whose components the job has; all: all that are installed; none; or a list of names, in"
+        " which own may stand",
     )
 
     @field_validator("figures", mode="before")

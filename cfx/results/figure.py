@@ -36,6 +36,14 @@ class JobFigure(Component):
         """Returns what is wrong with what a class declares; "" if nothing is."""
         return "" if cls.title and cls.caption else " has no title or no caption; give it both"
 
+    def is_usual(self, result: Result) -> bool:
+        """Says whether a job draws it unasked: the others take time, and `cfx figures` draws them.
+
+        Args:
+            result: of the job.
+        """
+        return True
+
     @abstractmethod
     def draw(self, result: Result) -> Figure | None:
         """Draws it, with `cfx.figures.canvas.blank` as its paper.

@@ -32,6 +32,7 @@ from cfx.evaluation.result import METHODS, Evaluation, PairTrajectory, Purpose
 from cfx.evaluation.statistics import STATISTICS, Improvement, are_comparable
 from cfx.evaluation.tables import scope_label
 from cfx.figures.drawing import as_html, drawn, remove_figures, write_figures
+from cfx.figures.wording import short_label
 from cfx.policies import checkpoint
 from cfx.results.config import JobConfig
 from cfx.results.folder import DATA, METRICS, begin, write_config, writing
@@ -245,6 +246,18 @@ class Result:
     def outside(self) -> dict[str, str]:
         """How much the policy drove outside what it has learned from, in words by scope."""
         return dict(self.data.get("outside") or {})
+
+    @property
+    def pooled_over(self) -> str:
+        """Whose parameters the method `pooled` has: "4 other folds"; "" if that is not known."""
+        protocol = self.data.get("protocol")
+        over = protocol.get("pooled_over") if isinstance(protocol, Mapping) else None
+        return str(over or "")
+
+    def method_label(self, method: str) -> str:
+        """Returns how a table names a method: of pooled parameters with whose they are."""
+        over = f" over {self.pooled_over}" if method == "pooled" and self.pooled_over else ""
+        return f"{short_label(method)}{over}"
 
     def scope_label(self, scope: str) -> str:
         """Returns how a part of the trajectories is named."""
@@ -656,7 +669,11 @@ def _trajectory(
 def _write_figures(folder: Path, result: Result, config: JobConfig) -> list[Path]:
     """Draws the figures that a configuration names, and says which others are installed."""
     remove_figures(folder)
-    figures = registry.chosen("figure", config.figures, distributions(config.model_dump()))
+    figures = []
+    for figure in registry.chosen("figure", config.figures, distributions(config.model_dump())):
+        is_named = config.figures == "all" or figure.name in config.figures
+        if is_named or figure.attempt(lambda one: one.is_usual(result), False):
+            figures.append(figure)
     paths = write_figures(folder, result, figures, formats=config.figure_formats)
     drawn_names = {figure.name for figure in figures}
     others = []
@@ -664,6 +681,6 @@ def _write_figures(folder: Path, result: Result, config: JobConfig) -> list[Path
         if figure.name not in drawn_names:
             others.append(figure.name)
     if others and config.figures != "none":
-        words = "Not drawn (figures=all, or figures=[own,NAME]): %s"
+        words = "Not drawn (cfx figures JOB, figures=all or figures=[own,NAME] draw them): %s"
         log.info(words, ", ".join(others), extra={"file_only": True})
     return paths

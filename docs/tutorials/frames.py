@@ -47,7 +47,7 @@ except cfx.errors.CfxError as error:
 # %%
 fit = cfx.calibrate(pairs, "idm", objective="gap_rmse")
 print(fit.parameters.head(3).round(2))
-print(fit.summary().round(2).to_string())
+print(fit.summary.round(2).to_string())
 
 # %% [markdown]
 # `fit.plot()` shows them between their bounds:

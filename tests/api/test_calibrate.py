@@ -85,7 +85,7 @@ def test_driver_specific_parameters_have_the_lowest_loss(fit: cfx.Fit) -> None:
 
 
 def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
-    table = fit.summary()
+    table = fit.summary
     assert table.loc["T", ["unit", "default"]].tolist() == ["s", 1.6]
     assert table["pooled"].tolist() == fit.pooled.tolist()
     assert table["at_bound"].between(0, 1).all()
@@ -349,3 +349,59 @@ def test_what_is_no_recording_is_said(given: Any) -> None:
         cfx.calibrate(given, "idm")
     with pytest.raises(ConfigError, match=r"give a (path|file)"):
         cfx.evaluate("cfx://i80-idm", given)
+
+
+def test_a_saved_fit_is_read_back_as_a_fit_and_as_a_job(fit: cfx.Fit, tmp_path: Path) -> None:
+    folder = fit.save(tmp_path / "fit")
+    again = cfx.Fit.load(folder)
+    pd.testing.assert_frame_equal(again.parameters, fit.parameters)
+    pd.testing.assert_frame_equal(again.losses, fit.losses)
+    assert repr(again) == repr(fit)
+    assert again.plot("drives", pair_id=fit.parameters.index[0]) is not None
+    own = cfx.load(folder).metrics["rmse_gap/driver_specific"]
+    losses = fit.losses[fit.losses["method"] == "driver_specific"]
+    assert own == pytest.approx(losses["test_rmse_gap"].mean())
+    with pytest.raises(DataError, match=r"holds no fit \(it has no parameters.parquet\)"):
+        cfx.Fit.load(tmp_path)
+
+
+def test_what_was_minimised_comes_first(fit: cfx.Fit) -> None:
+    assert repr(fit).index("RMSE of gap") < repr(fit).index("RMSE of speed")
+    assert fit.result.judge.name == "rmse_gap"
+
+
+def test_a_fit_drives_other_drivers_with_its_pooled_parameters(fit: cfx.Fit) -> None:
+    others = cfx.read(dataset="synthetic", pairs=2, frames=300, seed=5)
+    tested = cfx.evaluate(fit, others, optimizer="random", **{"optimizer.samples": 64})
+    rows = tested.pairs[tested.pairs["method"] == "pooled"]
+    chosen = rows.filter(like="parameter_").rename(columns=lambda one: one[len("parameter_") :])
+    for values in chosen[fit.pooled.index].to_numpy():
+        np.testing.assert_allclose(values, fit.pooled, rtol=1e-6)
+    ahead = cfx.forecast(fit, others, at=10.0, horizon=1.0)
+    driven = cfx.simulate(fit.model, fit.pooled, others, at=10.0)
+    for pair_id, path in ahead.paths.groupby("pair_id"):
+        its = driven[driven["pair_id"] == pair_id].head(len(path))
+        np.testing.assert_allclose(path["speed"], its["speed"], rtol=1e-6)
+
+
+def test_fits_are_compared_by_their_errors_on_the_test_part(fit: cfx.Fit) -> None:
+    worse = cfx.calibrate(
+        fit.recorded,
+        fit.model,
+        objective="gap_rmse",
+        optimizer="random",
+        **{"optimizer.samples": 2},
+    )
+    compared = cfx.compare(fit, worse, again=fit)
+    assert set(compared.ranking.jobs) == {"idm", "idm'", "again"}
+    own = fit.losses[fit.losses["method"] == "driver_specific"]["test_rmse_gap"].mean()
+    assert compared.table.loc["idm"].iloc[0] == pytest.approx(own)
+    assert "Closest to the drivers" in repr(compared)
+    with pytest.raises(ConfigError, match="two fits or results"):
+        cfx.compare(fit)
+
+
+def test_a_table_of_parameters_may_have_its_ids_in_a_column(fit: cfx.Fit) -> None:
+    from_index = cfx.simulate(fit.model, fit.parameters, fit.recorded)
+    from_column = cfx.simulate(fit.model, fit.parameters.reset_index(), fit.recorded)
+    pd.testing.assert_frame_equal(from_index, from_column)

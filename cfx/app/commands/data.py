@@ -15,7 +15,7 @@ from cfx.errors import ConfigError, DataError
 class DataCommand(Command):
     """Looks at recordings."""
 
-    summary = "what a recording holds (describe)"
+    summary = "what a recording holds (describe), and at which flow its drivers settle (flows)"
 
     def parser(self) -> argparse.ArgumentParser:
         parser = argparse.ArgumentParser("cfx data", description="Looks at recordings.")
@@ -38,11 +38,90 @@ class DataCommand(Command):
             metavar="FILE",
             help="draw the driving styles of the sites into a file (.png, .svg, .pdf)",
         )
+        flows = actions.add_parser(
+            "flows", help="at which gap drivers settle by speed, and the flow of such traffic"
+        )
+        flows.add_argument(
+            "files",
+            nargs="+",
+            metavar="FILE",
+            help="a recording; and settings of the reader, as for describe",
+        )
+        flows.add_argument(
+            "--output",
+            metavar="FILE",
+            help="JSON: the relation of speed and gap of each type of driver, for cfx drive stress"
+            " --recorded FILE",
+        )
         return parser
 
     def run(self, options: argparse.Namespace) -> int:
-        _describe(options)
+        if options.action == "flows":
+            _flows(options)
+        else:
+            _describe(options)
         return 0
+
+
+def _flows(options: argparse.Namespace) -> None:
+    """Prints the recorded relation of speed and flow of each type of driver.
+
+    Raises:
+        ConfigError: no file is named.
+        DataError: a file cannot be used, or nobody follows steadily in it.
+    """
+    from cfx.core import console, files
+    from cfx.core.registry import create
+    from cfx.data.base import Dataset
+    from cfx.data.known import with_known_types
+    from cfx.data.steady import flow, relations_of_types
+
+    overrides, paths = _overrides_and_files(options.files)
+    if not paths:
+        raise ConfigError("cfx data flows: name the recording")
+    node = _settings([*overrides, f"data.path=[{','.join(map(_quoted, paths))}]"])
+    dataset = create("dataset", node)
+    assert isinstance(dataset, Dataset)
+    pairs = with_known_types(dataset.load())
+    table = console.blank_table(
+        "driver", "speed [m/s]", "drivers", "flow [veh/h]", "quartiles of drivers [veh/h]"
+    )
+    for column in table.columns[1:]:
+        column.justify = "right"
+    relations = {}
+    for kind, relation in relations_of_types(pairs).items():
+        if len(relation.speed):
+            relations[kind or "unknown"] = relation.columns()
+        mean = flow(relation.speed, relation.gap)
+        fastest, slowest = flow(relation.speed, relation.low), flow(relation.speed, relation.high)
+        for row, speed in enumerate(relation.speed):
+            table.add_row(
+                kind or "unknown",
+                f"{speed:.1f}",
+                str(relation.drivers[row]),
+                f"{mean[row]:,.0f}",
+                f"{slowest[row]:,.0f} to {fastest[row]:,.0f}",
+            )
+    if not relations:
+        raise DataError(
+            f"{pairs.source}: fewer than three drivers follow a leader steadily at any speed"
+            " (within 0.5 m/s and 0.4 m/s2 for 3 s), so there is no flow to measure"
+        )
+    console.print_table(table)
+    if options.output is not None:
+        words = shlex.join(["cfx", "data", "flows", *map(_name_alone, options.files)])
+        output = Path(options.output).expanduser()
+        files.write_json(output, {"command": words, "relations": relations})
+
+
+def _quoted(path: str) -> str:
+    """Returns a path as Hydra's grammar has it."""
+    return "'" + path.replace("'", "\\'") + "'"
+
+
+def _name_alone(word: str) -> str:
+    """Returns a word of the command line, of a file its name without folders."""
+    return word if _is_setting(word) else Path(word).name
 
 
 def _describe(options: argparse.Namespace) -> None:
@@ -55,7 +134,7 @@ def _describe(options: argparse.Namespace) -> None:
     """
     from cfx.data.base import joined
     from cfx.data.describe import describe, describe_sites, describe_style
-    from cfx.data.sites import with_sites, with_vehicles
+    from cfx.data.known import with_names
     from cfx.data.style import StyleSettings, measure_style, style_distances
 
     overrides, files = _overrides_and_files(options.files)
@@ -82,7 +161,7 @@ def _describe(options: argparse.Namespace) -> None:
         return
     settings = settings or {}
     if pairs is not None:
-        pairs = with_vehicles(with_sites(pairs, settings.get("site")), settings.get("vehicle"))
+        pairs = with_names(pairs, settings.get("site"), settings.get("vehicle"))
     if pairs is None or len({pair.site for pair in pairs}) < 2:
         if compares:
             raise ConfigError(

@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import re
+import sys
 
 from cfx.app.completion import complete_with
 from cfx.core.command import Command
 from cfx.policies import ready
+from cfx.policies.ready.traffic_table import outside_words, traffic_of
 
 
 class PoliciesCommand(Command):
@@ -32,10 +35,31 @@ class PoliciesCommand(Command):
             folder = ready.folder_of_ready_made(
                 ready.SCHEME + options.name.removeprefix(ready.SCHEME)
             )
-            print((folder / "CARD.md").read_text("utf-8"))
+            _show((folder / "CARD.md").read_text("utf-8"))
             return 0
         _overview()
         return 0
+
+
+_WORD = re.compile(r"\*\*([a-z ]+)\*\* \|$")
+"""A word at the end of a row of the table of traffic: a value that is not usual."""
+
+
+def _show(text: str) -> None:
+    """Prints a card; on a terminal words for values that are not usual are red."""
+    from rich.console import Console
+    from rich.text import Text
+
+    if not sys.stdout.isatty():
+        print(text)
+        return
+    console = Console(markup=False, highlight=False, soft_wrap=True)
+    for line in text.splitlines():
+        shown = Text(line)
+        match = _WORD.search(line)
+        if match is not None:
+            shown.stylize("bold red", match.start(1), match.end(1))
+        console.print(shown)
 
 
 def _overview() -> None:
@@ -47,6 +71,7 @@ def _overview() -> None:
         "RMSE speed [m/s]",
         "over pooled",
         "RMS jerk [m/s3]",
+        "traffic: unusual",
         "size",
         "what it is",
     )
@@ -59,6 +84,7 @@ def _overview() -> None:
             f"{errors['rmse_speed']:.3f}",
             f"{errors['improvement_over_pooled']:+.1%}",
             f"{card['safety']['jerk']:.2f}",
+            _unusual(name),
             f"{card['size_kb']} kB",
             card["summary"],
         )
@@ -66,3 +92,12 @@ def _overview() -> None:
     print(
         "A policy's card: cfx policies show NAME. Drive with it: cfx drive --drivers car=cfx://NAME"
     )
+
+
+def _unusual(name: str) -> str:
+    """Returns how many values of a policy's traffic are not usual, of how many."""
+    measured = traffic_of(name)
+    if measured is None:
+        return "not measured"
+    unusual, compared = outside_words(measured)
+    return f"{unusual} of {compared}"

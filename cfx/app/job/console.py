@@ -121,7 +121,7 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
     With `with_improvement` a column says by how much the policy is better than each other method.
     """
     evaluation, metrics = result.evaluation, result.metrics
-    table = Table()
+    table = Table(collapse_padding=True)
     table.add_column("method", no_wrap=True)
     shown = []
     for metric in evaluation.measured:
@@ -149,7 +149,8 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
                 cells.append(_cell(metric, fitted[metric.name].get(method)))
         if method in baselines:
             cells.append(_improvement_cell(evaluation.improvements[scope][method]))
-        table.add_row(short_label(method), *cells)
+        label = result.method_label(method).replace(" over ", "\nover ")
+        table.add_row(label, *cells)
     return table
 
 

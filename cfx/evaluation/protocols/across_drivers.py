@@ -188,7 +188,7 @@ class AcrossDrivers(Protocol):
         """Calibrates and trains, and returns what is to be tested."""
         pairs = context.pairs
         fold = self.folds(pairs, seed=context.seed)
-        notes = describe_folds(pairs, fold, apart=self.settings.together in {"recording", "site"})
+        notes = describe_folds(pairs, fold, self.settings.together)
         members = learned_from(fold, int(fold.max()) + 1)
         split = Split.of(pairs, context.windows, context.split)
         tested = fold >= 0

@@ -45,6 +45,7 @@ from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler, token_width
 from cfx.policies.heads import head_class, head_name
 from cfx.policies.heads.base import ParameterHead
+from cfx.policies.population import DriverPopulation
 from cfx.policies.valid_range import recorded_quantiles
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import Windows, WindowSettings
@@ -110,6 +111,11 @@ class ProtocolContext:
     def _quantiles(self) -> dict[str, tuple[float, ...]]:
         """`TrainedOn.quantiles` of all agents here."""
         return recorded_quantiles(self.batch)
+
+    @cached_property
+    def _drivers(self) -> DriverPopulation | None:
+        """`TrainedOn.drivers` of trained agents here."""
+        return DriverPopulation.of(self.batch, self.policy.driver_features, self.pairs.drivers)
 
     def labels(self, counts: Tensor, fixed: Tensor) -> WindowLabels | None:
         """Calibrates parameters per window (labels), if the learner needs any.
@@ -264,7 +270,9 @@ class ProtocolContext:
             dt=self.stepper.dt,
             names=names,
             base=training_result.base,
-            trained_on=TrainedOn(learned_from, self._quantiles),
+            trained_on=TrainedOn(
+                learned_from, self._quantiles, drivers=self._drivers if policy.trainable else None
+            ),
             valid_range=training_result.valid_range,
             dispersion=training_result.dispersion,
         )

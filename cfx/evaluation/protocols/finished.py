@@ -102,6 +102,7 @@ class FinishedPolicy:
         )
         notes = {
             "run": str(self.run),
+            "pooled_over": "its training drivers",
             "pairs_learned_from": len(policy.trained_on.pairs),
             "drivers_named_as_some_learned_from": self._named_alike(pairs),
         }

@@ -151,13 +151,13 @@ def _follower(pair: Pair) -> str:
     return f"{pair.recording}/{pair.follower_id}"
 
 
-def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, Any]:
+def describe_folds(pairs: PairSet, fold: Tensor, together: Together) -> dict[str, Any]:
     """Counts vehicles that stand on both sides of a fold, though never as followers; logs it.
 
     Args:
         pairs: P pairs.
         fold: `(P,)`, as `assign_folds` returns it.
-        apart: no recording is on both sides.
+        together: what a fold keeps together.
 
     Returns:
         What `data.json` says of the folds.
@@ -176,29 +176,37 @@ def describe_folds(pairs: PairSet, fold: Tensor, *, apart: bool) -> dict[str, An
         recordings.append(
             sorted({pair.recording for pair, place in tested_there if place == number})
         )
-    log.info(
-        "%d folds over %d drivers; %d of %d test pairs follow a driver of the training part,"
-        " %d test drivers lead one there",
-        folds,
-        len(fold_of_driver),
-        behind_trained,
-        tested,
-        len(leaders),
-    )
+    known = [pair for pair in pairs if pair.leader_id != f"ahead of {pair.follower_id}"]
+    if known:
+        log.info(
+            "%d folds over %d drivers; %d of %d test pairs follow a driver of the training part,"
+            " %d test drivers lead one there",
+            folds,
+            len(fold_of_driver),
+            behind_trained,
+            tested,
+            len(leaders),
+        )
+    else:
+        log.info(
+            "%d folds over %d drivers; who leads whom is not known", folds, len(fold_of_driver)
+        )
     if tested < len(pairs):
         log.info("%d shorter pairs are only learned from", len(pairs) - tested)
-    if apart:
+    if together in {"recording", "site"}:
         for number, names in enumerate(recordings):
             text = "Fold %d is tested on %s and learns nothing from there"
             log.info(text, number, listed(names, 3))
     in_folds = list(fold_of_driver.values())
+    others = "sites" if together == "site" else "recordings" if together == "recording" else "folds"
     return {
         "folds": folds,
+        "pooled_over": f"{folds - 1} other {others if folds > 2 else others[:-1]}",
         "recordings_per_fold": recordings,
         "drivers": len(fold_of_driver),
         "drivers_per_fold": [in_folds.count(number) for number in range(folds)],
-        "test_pairs_behind_a_training_driver": behind_trained,
-        "test_drivers_who_lead_a_training_pair": len(leaders),
+        "test_pairs_behind_a_training_driver": behind_trained if known else None,
+        "test_drivers_who_lead_a_training_pair": len(leaders) if known else None,
         "pairs_only_learned_from": len(pairs) - tested,
     }
 

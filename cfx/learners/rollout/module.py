@@ -25,7 +25,9 @@ from torch.utils.data import DataLoader
 
 from cfx.core.engine import Report
 from cfx.learners.batched import BatchedModule, fit
+from cfx.learners.rollout import equilibrium
 from cfx.learners.rollout.dataset import RolloutBatch, RolloutDataset
+from cfx.learners.rollout.equilibrium import SteadySampler
 from cfx.learners.rollout.loop import CompiledLoop, Expert, simulate
 from cfx.learners.rollout.loss import Divisors, FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
@@ -114,6 +116,15 @@ class RolloutModule(BatchedModule):
             self.loss.frame_weights = self._frame_weights()
         clip = settings.gradient_clip_state / self.sampler.trajectories
         self.through_time = GradientPath(settings.gradient_decay, clip, settings.tbptt_windows)
+        self.steady: SteadySampler | None = None
+        if shard.equilibrium is not None:
+            self.steady = SteadySampler(
+                dataset,
+                shard.equilibrium,
+                settings.equilibrium_s,
+                windows.stride,
+                windows.length,
+            )
         self.losses: list[Tensor] = []
         self._noise_of = 0  # the gradient step whose noise is drawn
         self.dispersion = torch.ones(len(dataset.pair), device=device)
@@ -170,6 +181,8 @@ class RolloutModule(BatchedModule):
         )
         for loss in losses:
             yield (loss * batch.weight).sum(1) / count
+        if self.steady is not None and expert is None:
+            yield self._steady_loss(step)
 
     def trajectory_losses(
         self,
@@ -221,6 +234,33 @@ class RolloutModule(BatchedModule):
                 others = segment.only(slice(centre.stop, None))
                 loss = loss + self.loss.of_paths(others, divisors, sampled)
             yield loss
+
+    def _steady_loss(self, step: int | None) -> Tensor:
+        """Returns the weighted error of the gaps at which drivers settle, `(N,)`.
+
+        Args:
+            step: number of the gradient step; None: of validation, without gradients.
+        """
+        assert self.steady is not None
+        s = self.settings
+        if step is None:
+            steady, window, path = self.steady.validation(), self.exact_step, None
+        else:
+            generator = torch.Generator().manual_seed(self.sampler.step_seed(step))
+            steady, window = self.steady.training(generator), self.training_window
+            clip = s.gradient_clip_state / steady.target.shape[1]
+            path = GradientPath(equilibrium.DECAY, clip)
+        segment = next(
+            simulate(
+                window,
+                steady.dataset,
+                steady.batch,
+                self.steady.windows,
+                path,
+                compiled=self.compiled.get(window),
+            )
+        )
+        return s.equilibrium_weight * steady.loss(segment)
 
     def curves(self) -> pd.DataFrame:
         """As `BatchedModule.curves`.
@@ -346,11 +386,19 @@ class RolloutModule(BatchedModule):
         self.judge(train, self.validation_loss().cpu(), hopeful=is_hopeful)
 
     def validation_loss(self) -> Tensor:
-        """Returns the loss of validation trajectories with the exact model, `(N,)`.
+        """Returns the loss of validation with the exact model, `(N,)`.
 
+        The error of the gaps at which drivers settle is part of it where it is part of training.
         NaN for a network that keeps no driver for validation. Cold starts count as much as they do
         in training, where a network keeps whole trajectories.
         """
+        loss = self._trajectories_loss()
+        if self.steady is not None:
+            loss = loss + self._steady_loss(None)
+        return loss
+
+    def _trajectories_loss(self) -> Tensor:
+        """Returns the loss of validation trajectories, `(N,)`."""
         sampler = self.sampler
         if sampler.validation_places.shape[1] == 0:
             return torch.full((len(sampler.validation_places),), torch.nan)

@@ -148,6 +148,19 @@ class LossSettings(Settings):
         description="weight of the RMS jerk (m/s3) beside the errors; 0.01 costs little accuracy"
         " and makes the trajectories much smoother",
     )
+    equilibrium_weight: float = Field(
+        0.0,
+        ge=0,
+        description="weight of the RMS relative error of the spacing at which drivers settle behind"
+        " leaders of constant speed, from any start, against the recorded relation of gap and speed"
+        " of the drivers that are learned from; 0: none",
+    )
+    equilibrium_s: float = Field(
+        60.0,
+        ge=5,
+        le=600,
+        description="s that these trajectories last; the second half counts",
+    )
     gradient_decay: float = Field(
         0.8,
         gt=0,

@@ -25,6 +25,7 @@ from cfx.core.local_engine import LocalEngine
 from cfx.learners import base
 from cfx.learners.base import TrainingData, TrainingPairs
 from cfx.learners.rollout.dataset import RolloutDataset
+from cfx.learners.rollout.equilibrium import EquilibriumTargets
 from cfx.learners.rollout.loss import BaseErrors
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.models.direct import Direct
@@ -114,6 +115,7 @@ class TrainingShard:
         checkpoint: the file from which interrupted training goes on; None: no such file.
         expert: experts that drive by `Direct`, and learn from the same trajectories before; None:
             without distillation.
+        equilibrium: the gaps at which drivers are to settle; None: any.
     """
 
     settings: RolloutSettings
@@ -124,6 +126,7 @@ class TrainingShard:
     weights: dict[str, Tensor]
     checkpoint: Path | None = None
     expert: TrainingShard | None = None
+    equilibrium: EquilibriumTargets | None = None
 
     @property
     def head(self) -> ParameterHead:
@@ -212,8 +215,12 @@ def cut(
         files: from which interrupted training goes on (`shard_checkpoints`).
     """
     errors = BaseErrors.of(training_data, dataset, settings.horizon)
+    equilibrium = None
+    if settings.equilibrium_weight > 0:
+        equilibrium = EquilibriumTargets.of(training_data, dataset)
     weights, training_data = network.state_dict(), _without_pairs(training_data)
     whole = TrainingShard(settings, policy, training_data, dataset, errors, weights)
+    whole = replace(whole, equilibrium=equilibrium)
     expert_weights = {}
     if settings.distillation_epochs:
         generator = torch.Generator().manual_seed(training_data.seed)
@@ -229,6 +236,7 @@ def cut(
                 training_data=replace(training_data, names=names),
                 dataset=dataset.only(networks),
                 errors=errors.only(networks),
+                equilibrium=equilibrium and equilibrium.only(networks),
             )
         if expert_weights:
             shard = replace(shard, expert=_expert(shard, _weights(expert_weights, networks)))
@@ -277,6 +285,7 @@ def _expert(shard: TrainingShard, weights: dict[str, Tensor]) -> TrainingShard:
         dataset=shard.dataset.for_base(default),
         weights=weights,
         checkpoint=checkpoint,
+        equilibrium=None,
     )
 
 

@@ -466,6 +466,10 @@ class Speeds(JobFigure):
     caption = "The test part of the pair in the middle, a panel per method."
     order = 30
 
+    def is_usual(self, result: Result) -> bool:
+        """Returns False: `drives` shows the speeds of three pairs."""
+        return False
+
     def draw(self, result: Result) -> Figure | None:
         """Draws it where trajectories are known."""
         if not len(result.trajectories):

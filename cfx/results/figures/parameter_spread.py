@@ -12,6 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from cfx.evaluation.result import Purpose
 from cfx.figures import canvas, colours, wording
 from cfx.results.figure import JobFigure
 
@@ -232,6 +233,10 @@ class Calibration(JobFigure):
         " spread over the whole range, these recordings may hardly determine the parameter."
     )
     order = 70
+
+    def is_usual(self, result: Result) -> bool:
+        """Returns whether the job is a calibration; of a policy its own choices say more."""
+        return result.purpose is Purpose.CALIBRATION
 
     def draw(self, result: Result) -> Figure | None:
         """Draws it where drivers have parameters of their own."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import shlex
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 
+from cfx.errors import ConfigError
 from cfx.plugin import Command
 
 
@@ -62,6 +64,12 @@ class DriveCommand(Command):
             help="CSV: where each driven vehicle is at each step, and its parameters",
         )
         parser.add_argument(
+            "--report",
+            metavar="FOLDER",
+            help="flows, headways and time-space diagrams, beside those of SUMO's own models in the"
+            " same scenario, which is run once more for it",
+        )
+        parser.add_argument(
             "--look-ahead",
             type=float,
             default=200.0,
@@ -73,6 +81,25 @@ class DriveCommand(Command):
             type=int,
             default=31,
             help="SUMO's bit set; 31 (default): SUMO's own checks bound each speed; 0: none, exact",
+        )
+        parser.add_argument(
+            "--average",
+            action="store_true",
+            help="all vehicles of a policy have one average driver; otherwise each draws one of the"
+            " recorded drivers that the policy learned from, by its id and the seed",
+        )
+        parser.add_argument(
+            "--traffic",
+            metavar="FOLDER",
+            help="stress: measure the traffic that the driver makes, in place of single events;"
+            " tables and a figure go to FOLDER. At --step, or at 0.1, 0.5 and 1 s",
+        )
+        parser.add_argument(
+            "--recorded",
+            default="human",
+            metavar="WHOSE",
+            help="whose flows stand beside those of --traffic: human (default), acc, or a file that"
+            " cfx data flows wrote",
         )
         return parser
 
@@ -99,7 +126,13 @@ def _drive(options: argparse.Namespace) -> None:
     """
     from cfx_sumo.installed import require_sumo
 
-    require_sumo()
+    if options.traffic is None:
+        require_sumo()
+    elif options.scenario != "stress":
+        raise ConfigError(
+            f"--traffic belongs to the scenario stress, not to {options.scenario}: cfx drive stress"
+            " --traffic FOLDER"
+        )
     # libsumo does not get on with pyarrow, and pandas loads it where it finds it: this process does
     # without.
     # None is Python's own way to say that a module is not there.
@@ -111,8 +144,14 @@ def _drive(options: argparse.Namespace) -> None:
     output = None
     if options.output:
         output = Path(options.output).expanduser()
+    report_to = None
+    if options.report:
+        report_to = Path(options.report).expanduser()
     with console.console_logging():
         runs = parse_drivers(options.drivers)
+        if options.traffic is not None:
+            _measure_traffic(options, runs)
+            return
         if options.scenario == "stress":
             from cfx_sumo.drive.stress import report_stress, run_stress
 
@@ -135,9 +174,48 @@ def _drive(options: argparse.Namespace) -> None:
             step=options.step,
             seed=options.seed,
             output=output,
+            report_to=report_to,
             look_ahead=options.look_ahead,
+            average=options.average,
             speed_mode=options.speed_mode,
             gui=options.gui,
             sumo_options=options.sumo_options,
         )
         report(run)
+        if report_to is not None:
+            print(f"Flows, headways and diagrams: {report_to}")
+
+
+def _measure_traffic(options: argparse.Namespace, runs: dict[str, str]) -> None:
+    """Measures the traffic of a driver; prints it, and writes it into a folder.
+
+    Raises:
+        ConfigError: the scenario is not `stress`.
+        CfxError: whatever `cfx_sumo.drive.traffic.measure_traffic` raises.
+    """
+    from cfx_sumo.drive.traffic import (
+        STEPS_S,
+        check_alone,
+        measure_traffic,
+        print_traffic,
+        write_traffic,
+    )
+
+    steps = STEPS_S if options.step is None else (options.step,)
+    report = measure_traffic(
+        check_alone(runs),
+        recorded=options.recorded,
+        steps=steps,
+        seed=options.seed or 0,
+        sumo_options=options.sumo_options,
+    )
+    print_traffic(report)
+    folder = Path(options.traffic).expanduser()
+    words = ["cfx", "drive", "stress", "--drivers", *options.drivers]
+    if options.recorded != "human":
+        words += ["--recorded", options.recorded]
+    if options.step is not None:
+        words += ["--step", f"{options.step:g}"]
+    words += ["--traffic", "FOLDER"]
+    write_traffic(report, folder, shlex.join(words))
+    print(f"Tables and figure: {folder}")

@@ -26,6 +26,7 @@ from cfx.policies.core import AgentCore
 from cfx.policies.features import Scaler
 from cfx.policies.heads.base import DirectHead
 from cfx.policies.heads.offset import shrunk
+from cfx.policies.population import DriverPopulation
 from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper
 from cfx_sumo.demo.motorway import read_motorway
@@ -724,3 +725,33 @@ def test_in_sumo_a_policy_drives_as_in_memory(
         assert memory.std(axis=0).max() > 1e-3, "the policy changes what it chooses"
         assert one.gap["real"] == pytest.approx(one.pair.gap, abs=1e-9)
         assert one.speed["real"] == pytest.approx(one.pair.follower_speed, abs=1e-12)
+
+
+def fleet_of_three(**options: Any) -> Driver:
+    """Returns a driver whose policy knows three drivers, who have other time headways."""
+    drivers = DriverPopulation(torch.tensor([[0.1], [8.0], [16.0]]).double(), torch.ones(3) / 3)
+    policy = adaptive({"name": "krauss"}, driver_features=("time_headway",))
+    policy = replace(policy, trained_on=replace(policy.trained_on, drivers=drivers))
+    return Driver(policy, **options)
+
+
+def chosen_by(driver: Driver, names: Sequence[str]) -> dict[str, float]:
+    """Returns the first t_r of vehicles that are named in this order."""
+    road = Road(lead=Car(), **{name: Car(leader="lead") for name in names})
+    driver.step(road, list(names))
+    return {name: driver.parameters(name)["t_r"] for name in names}
+
+
+def test_each_vehicle_of_a_fleet_draws_a_recorded_driver() -> None:
+    """By its id and the seed alone: another order, other vehicles beside it change nobody's."""
+    names = [f"car{number}" for number in range(12)]
+    chosen = chosen_by(fleet_of_three(), names)
+    assert len(set(chosen.values())) == 3
+    again = chosen_by(fleet_of_three(), [*reversed(names), "late"])
+    assert {name: again[name] for name in names} == chosen
+    assert chosen_by(fleet_of_three(seed=1), names) != chosen
+    average = chosen_by(fleet_of_three(average=True), names)
+    assert len(set(average.values())) == 1
+    told = fleet_of_three()
+    told.assign("car0", driver_features={"time_headway": 4.0})
+    assert chosen_by(told, names)["car0"] not in chosen.values()

@@ -13,6 +13,7 @@ from cfx.app import cli
 from cfx.app.job.steps import JobComponents, complete, make_protocol
 from cfx.errors import DataError
 from cfx.policies import checkpoint, ready
+from cfx.policies.ready.traffic_table import NOT_FOR_TRAFFIC, traffic_lines, traffic_of
 from tests.histories import observed
 
 NAMES = ready.names()
@@ -26,6 +27,7 @@ def test_each_is_small_and_holds_no_code_and_no_recording(name: str) -> None:
         "card.json",
         "CARD.md",
         "metrics.json",
+        "traffic.json",
         "policy/policy.json",
         "policy/policy.safetensors",
     }
@@ -70,6 +72,23 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
     if "sites" in card:
         assert "CC BY 4.0" in text
     assert "Valid range" in text
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_card_has_a_table_of_traffic(name: str) -> None:
+    """It was measured as its command says; only policies of many roads are for traffic."""
+    measured, card = traffic_of(name), ready.card_of(name)
+    assert measured is not None
+    text = (ready.READY_FOLDER / name / "CARD.md").read_text(encoding="utf-8")
+    for line in traffic_lines(measured):
+        assert line in text
+    assert f"cfx drive stress --drivers car=cfx://{name}" in measured["command"]
+    kinds = {row["measure"] for row in measured["rows"]}
+    assert kinds >= {"capacity", "saturation_flow", "discharge", "town_throughput", "dip_last"}
+    knows_drivers = cfx.load(f"cfx://{name}").policy.trained_on.drivers is not None
+    assert bool(measured["time_gaps"]) == knows_drivers
+    assert card["for_traffic"] == (not name.startswith("i80-"))
+    assert (NOT_FOR_TRAFFIC in text) != card["for_traffic"]
 
 
 @pytest.mark.parametrize(

@@ -215,6 +215,16 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
             self._information(outcome),
         )
 
+    def begin_over(self) -> Array:
+        """Begins the next episode at once where one is over; returns observations of all.
+
+        For libraries that expect it in the step in which an episode ends.
+        """
+        index = self._over.nonzero().flatten()
+        if len(index):
+            self._begin(index, self._drawn(len(index)))
+        return self._observation()
+
     def render(self) -> tuple[Array, ...]:
         """Returns a picture of each environment, `(H, W, 3)` uint8; none without a render mode."""
         if self.render_mode is None:

@@ -13,11 +13,9 @@ import pandas as pd
 import torch
 from torch import Tensor
 
-from cfx.plugin import RECORDED, PairBatch
+from cfx.plugin import RECORDED, PairBatch, roads, waves
 from cfx_forecasts.traffic.edie import PER_HOUR, PER_KM, Strips, region, strips_of
-from cfx_forecasts.traffic.roads import Driven, Lanes, Road
 from cfx_forecasts.traffic.tables import GROWTH_COLUMNS, PATH_COLUMNS, ROAD_COLUMNS, STRIP_COLUMNS
-from cfx_forecasts.traffic.waves import PairWaves, pair_waves, ring_waves
 
 KMH = 3.6
 
@@ -48,14 +46,14 @@ class Settled(NamedTuple):
     interval: float
 
     @classmethod
-    def of(cls, driven: Driven, lanes: Lanes, settle: float) -> Settled:
+    def of(cls, driven: roads.Driven, lanes: roads.Lanes, settle: float) -> Settled:
         """Leaves out the first seconds."""
         first = round(settle / driven.interval)
         position, speed = driven.position[:, first:], driven.speed[:, first:]
         ahead = position[lanes.ahead] + lanes.offset[:, None]
         return cls(position, speed, ahead, speed[lanes.ahead], driven.interval)
 
-    def of_road(self, road: Road) -> Settled:
+    def of_road(self, road: roads.Road) -> Settled:
         """Returns the vehicles of one road."""
         own = road.vehicles
         return Settled(
@@ -79,7 +77,7 @@ class Measured(NamedTuple):
 
 
 def traffic_of(
-    driven: Mapping[str, Driven], lanes: Lanes, settle: float, batch: PairBatch
+    driven: Mapping[str, roads.Driven], lanes: roads.Lanes, settle: float, batch: PairBatch
 ) -> Measured:
     """Measures simulated traffic and the recording.
 
@@ -89,27 +87,29 @@ def traffic_of(
         settle: s from the start that do not count.
         batch: P recorded pairs.
     """
-    roads, growth, strips, paths = [], [], [], []
+    of_roads, growth, strips, paths = [], [], [], []
     shown = _shown_ring(lanes)
     for method, drove in driven.items():
         settled = Settled.of(drove, lanes, settle)
         for road in lanes.roads:
-            roads.append({"method": method} | _road_row(road, drove, settled.of_road(road), lanes))
+            of_roads.append(
+                {"method": method} | _road_row(road, drove, settled.of_road(road), lanes)
+            )
         growth.append(_growth(method, lanes, settled))
         strips.append(_strips_table(method, _ring_strips(lanes, settled)))
         if shown is not None:
             paths.append(_paths(method, shown, settled.of_road(shown)))
     strips.append(_strips_table(RECORDED, recorded_strips(batch)))
-    waves = recorded_waves(batch)
+    of_recording = recorded_waves(batch)
     tables = {
-        "traffic": pd.DataFrame(roads, columns=list(ROAD_COLUMNS)),
+        "traffic": pd.DataFrame(of_roads, columns=list(ROAD_COLUMNS)),
         "traffic_growth": pd.concat(growth, ignore_index=True),
         "traffic_strips": pd.concat(strips, ignore_index=True),
         "traffic_paths": pd.concat(
             [pd.DataFrame(columns=list(PATH_COLUMNS)), *paths], ignore_index=True
         ),
     }
-    return Measured(tables, KMH * waves.speed, waves.measured)
+    return Measured(tables, KMH * of_recording.speed, of_recording.measured)
 
 
 def recorded_strips(batch: PairBatch) -> Strips:
@@ -118,9 +118,9 @@ def recorded_strips(batch: PairBatch) -> Strips:
     return strips_of(spacing, batch.follower_speed, batch.mask, batch.dt)
 
 
-def recorded_waves(batch: PairBatch) -> PairWaves:
+def recorded_waves(batch: PairBatch) -> waves.PairWaves:
     """Returns how waves travel in each of P recorded pairs."""
-    return pair_waves(
+    return waves.pair_waves(
         batch.leader_position,
         batch.leader_speed,
         batch.follower_position,
@@ -130,7 +130,9 @@ def recorded_waves(batch: PairBatch) -> PairWaves:
     )
 
 
-def _road_row(road: Road, driven: Driven, settled: Settled, lanes: Lanes) -> dict[str, object]:
+def _road_row(
+    road: roads.Road, driven: roads.Driven, settled: Settled, lanes: roads.Lanes
+) -> dict[str, object]:
     """Returns what is measured on one road, by the columns of `ROAD_COLUMNS`."""
     gaps = driven.min_gap[road.vehicles]
     row: dict[str, object] = {
@@ -149,12 +151,12 @@ def _road_row(road: Road, driven: Driven, settled: Settled, lanes: Lanes) -> dic
     return row
 
 
-def _of_ring(road: Road, settled: Settled) -> dict[str, object]:
+def _of_ring(road: roads.Road, settled: Settled) -> dict[str, object]:
     """Returns flow and waves of a ring; its area holds all vehicles all the time."""
     density = len(settled.speed) / road.circumference * PER_KM
     mean = float(settled.speed.mean())
     everywhere = torch.ones_like(settled.speed, dtype=torch.bool)
-    of_pairs = pair_waves(
+    of_pairs = waves.pair_waves(
         settled.ahead,
         settled.ahead_speed,
         settled.position,
@@ -162,18 +164,20 @@ def _of_ring(road: Road, settled: Settled) -> dict[str, object]:
         everywhere,
         settled.interval,
     )
-    waves = ring_waves(settled.position, settled.speed, road.circumference, settled.interval)
+    of_ring = waves.ring_waves(
+        settled.position, settled.speed, road.circumference, settled.interval
+    )
     return {
         "density": density,
         "flow": density / PER_KM * mean * PER_HOUR,
         "speed": mean,
         "wave_speed": KMH * of_pairs.speed,
-        "ring_wave_speed": KMH * waves.speed,
-        "coherence": waves.coherence,
+        "ring_wave_speed": KMH * of_ring.speed,
+        "coherence": of_ring.coherence,
     }
 
 
-def _of_bottleneck(settled: Settled, lanes: Lanes) -> dict[str, object]:
+def _of_bottleneck(settled: Settled, lanes: roads.Lanes) -> dict[str, object]:
     """Returns what is measured before the bottleneck of an open road, and behind it."""
     zone = lanes.bottleneck
     place = (settled.position, settled.speed)
@@ -187,7 +191,7 @@ def _of_bottleneck(settled: Settled, lanes: Lanes) -> dict[str, object]:
     }
 
 
-def _growth(method: str, lanes: Lanes, settled: Settled) -> pd.DataFrame:
+def _growth(method: str, lanes: roads.Lanes, settled: Settled) -> pd.DataFrame:
     """Returns the rows of `Growth` of one method."""
     parts = []
     for road in lanes.roads:
@@ -203,7 +207,7 @@ def _growth(method: str, lanes: Lanes, settled: Settled) -> pd.DataFrame:
     return table[list(GROWTH_COLUMNS)]
 
 
-def _ring_strips(lanes: Lanes, settled: Settled) -> Strips:
+def _ring_strips(lanes: roads.Lanes, settled: Settled) -> Strips:
     """Returns the strips of all rings."""
     parts = []
     for road in lanes.roads:
@@ -221,13 +225,13 @@ def _strips_table(method: str, strips: Strips) -> pd.DataFrame:
     return pd.DataFrame({"method": method, **columns})[list(STRIP_COLUMNS)]
 
 
-def _shown_ring(lanes: Lanes) -> Road | None:
+def _shown_ring(lanes: roads.Lanes) -> roads.Road | None:
     """Returns the ring whose vehicles are shown: of those in the middle of the densities."""
     rings = [road for road in lanes.roads if road.kind == "ring" and road.repetition == 0]
     return rings[len(rings) // 2] if rings else None
 
 
-def _paths(method: str, road: Road, settled: Settled) -> pd.DataFrame:
+def _paths(method: str, road: roads.Road, settled: Settled) -> pd.DataFrame:
     """Returns rows of `Paths` of one method."""
     every = max(1, round(PATH_STEP_S / settled.interval))
     position, speed = _array(settled.position[:, ::every]), _array(settled.speed[:, ::every])

@@ -29,19 +29,10 @@ from cfx.plugin import (
     burnt_in,
     measured_history,
     require_memory,
+    roads,
 )
 from cfx_forecasts.noise import can_drive, constant_with_noise, residual_noise
 from cfx_forecasts.traffic.measure import UPSTREAM_M, Measured, traffic_of
-from cfx_forecasts.traffic.roads import (
-    Bottleneck,
-    Driven,
-    Lanes,
-    joined,
-    open_roads,
-    platoons,
-    ring_roads,
-    simulate_roads,
-)
 
 log = logging.getLogger(__name__)
 
@@ -141,7 +132,7 @@ class TrafficProtocol(FoldsOrFinished):
 
     Folds, calibration, training and the test part are those of `across_drivers`; with `run` they
     are those of `transfer`, and nothing is trained. Beyond it, test drivers are set on roads, all
-    at once (`cfx_forecasts.traffic.roads`): on ring roads of each density, on open roads with a
+    at once (`cfx.evaluation.roads`): on ring roads of each density, on open roads with a
     bottleneck at each demand, and in platoons behind leaders that keep their speed. Each vehicle is
     a test driver, drawn with replacement; every method has the same drivers at the same places:
 
@@ -194,7 +185,7 @@ class TrafficProtocol(FoldsOrFinished):
             calibration=trained.calibration,
         )
 
-    def _lanes(self, context: ProtocolContext, length: float) -> Lanes:
+    def _lanes(self, context: ProtocolContext, length: float) -> roads.Lanes:
         """Returns all roads.
 
         Raises:
@@ -211,14 +202,16 @@ class TrafficProtocol(FoldsOrFinished):
         self._check(length, context.windows.stride * context.stepper.dt)
         generator = torch.Generator().manual_seed(context.seed * _DRAWN + 1)
         parts = [
-            ring_roads(s.densities, s.vehicles, s.repetitions, length, s.perturbation, generator)
+            roads.ring_roads(
+                s.densities, s.vehicles, s.repetitions, length, s.perturbation, generator
+            )
         ]
         if s.demands:
-            bottleneck = Bottleneck(*s.bottleneck, s.bottleneck_speed)
-            parts.append(open_roads(s.demands, s.entry_speed, s.duration, bottleneck, length))
+            bottleneck = roads.Bottleneck(*s.bottleneck, s.bottleneck_speed)
+            parts.append(roads.open_roads(s.demands, s.entry_speed, s.duration, bottleneck, length))
         if s.leader_speeds:
-            parts.append(platoons(s.leader_speeds, s.platoon, s.repetitions, length))
-        return joined(parts).to(context.batch.lengths.device)
+            parts.append(roads.platoons(s.leader_speeds, s.platoon, s.repetitions, length))
+        return roads.joined(parts).to(context.batch.lengths.device)
 
     def _check(self, length: float, interval: float) -> None:
         """Checks whether vehicles of this length, m, fit on the roads and into the memory.
@@ -252,13 +245,13 @@ class TrafficProtocol(FoldsOrFinished):
                 f" {s.entry_speed * 3600.0 / spacing:.0f}"
             )
 
-    def _traffic(self, test: HeldOut, lanes: Lanes) -> Measured:
+    def _traffic(self, test: HeldOut, lanes: roads.Lanes) -> Measured:
         """Lets all kinds of drivers drive on all roads, and measures."""
         s, context = self.settings, test.context
         generator = torch.Generator().manual_seed(context.seed * _DRAWN + 2)
         drivers = torch.randint(len(test.pairs), (len(lanes),), generator=generator)
         drivers = drivers.to(lanes.position.device)
-        driven: dict[str, Driven] = {}
+        driven: dict[str, roads.Driven] = {}
         for method, kind in self._kinds(test).items():
             log.info(
                 "Traffic: %d vehicles on %d roads for %g s, driven by %s",
@@ -271,7 +264,7 @@ class TrafficProtocol(FoldsOrFinished):
             if kind.draws:
                 chance = torch.Generator().manual_seed(context.seed * _DRAWN + 3)
             state = kind.state.of(drivers)
-            driven[method] = simulate_roads(
+            driven[method] = roads.simulate_roads(
                 context.stepper.model, kind.agent, state, lanes, s.duration, chance
             )
         return traffic_of(driven, lanes, s.settle, test.batch)
@@ -294,7 +287,7 @@ class TrafficProtocol(FoldsOrFinished):
                 kinds["policy_sampled"] = _Kind(test.policy, state, draws=True)
         return kinds
 
-    def _described(self, lanes: Lanes, traffic: Measured) -> dict[str, Any]:
+    def _described(self, lanes: roads.Lanes, traffic: Measured) -> dict[str, Any]:
         """Returns what `data.json` says of the traffic."""
         speed = traffic.real_wave_speed
         return {

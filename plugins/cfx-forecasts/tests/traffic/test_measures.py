@@ -11,10 +11,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from cfx.evaluation.waves import pair_waves, ring_waves
 from cfx_forecasts.traffic.edie import STRIP_S, region, strips_of
 from cfx_forecasts.traffic.summary import binned, common_variation, flow_errors
 from cfx_forecasts.traffic.tables import STRIP_COLUMNS
-from cfx_forecasts.traffic.waves import pair_waves, ring_waves
 
 DT = 0.5
 

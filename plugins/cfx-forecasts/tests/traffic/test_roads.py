@@ -7,15 +7,7 @@ import torch
 from torch import Tensor
 
 import cfx
-from cfx.models.base import DrivingModel
-from cfx.models.idm import IDM
-from cfx.models.krauss import Krauss
-from cfx.models.w99 import W99
-from cfx_community.models.optimal_velocity import optimal_velocity
-from cfx_community.models.ovm import OVM
-from cfx_forecasts.traffic.edie import region
-from cfx_forecasts.traffic.measure import Settled
-from cfx_forecasts.traffic.roads import (
+from cfx.evaluation.roads import (
     Bottleneck,
     Driven,
     Lanes,
@@ -25,6 +17,14 @@ from cfx_forecasts.traffic.roads import (
     ring_roads,
     simulate_roads,
 )
+from cfx.models.base import DrivingModel
+from cfx.models.idm import IDM
+from cfx.models.krauss import Krauss
+from cfx.models.w99 import W99
+from cfx_community.models.optimal_velocity import optimal_velocity
+from cfx_community.models.ovm import OVM
+from cfx_forecasts.traffic.edie import region
+from cfx_forecasts.traffic.measure import Settled
 from tests.evaluation.test_closed_loop import adaptive, constant
 from tests.evaluation.test_platoon import STABLE, UNSTABLE, Linear
 

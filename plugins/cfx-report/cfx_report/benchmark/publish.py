@@ -26,6 +26,7 @@ from cfx.plugin import (
     files,
     load_agent,
     save_agent,
+    traffic_table,
     valid_range,
 )
 from cfx_report.benchmark.recipes import I80, RECIPES
@@ -37,6 +38,9 @@ _SOURCES = {
     " Vicolungo, Ispra; resampled to 0.1 s",
 }
 """Who recorded a file, by how its name begins."""
+
+TRAFFIC_STEP = "0.5"
+"""s: step of SUMO at which a card's traffic is measured, in the middle of usual ones."""
 
 _LICENCE = "MIT, as cfx; the recordings that it was trained on are in the public domain"
 _LICENCE_OF_OPENACC = "MIT, as cfx; made with OpenACC's recordings, which are CC BY 4.0"
@@ -103,8 +107,10 @@ def publish(name: str, job: Path) -> None:
     card["size_kb"] = _kilobytes(folder)
     card["stress"] = _stress(folder)
     files.write_json(folder / "card.json", card)
+    measured = _traffic(name, folder)
+    files.write_json(folder / traffic_table.FILE, measured)
     with files.atomic_write(folder / "CARD.md") as temporary:
-        temporary.write_text(card_text(card), encoding="utf-8")
+        temporary.write_text(card_text(card, measured), encoding="utf-8")
     print(f"wrote {folder}")
 
 
@@ -177,6 +183,7 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
         "limits": _limits(agent),
         "valid_range": _range(agent),
         "base_parameters": _base(agent),
+        "for_traffic": RECIPES[name].is_for_traffic,
     }
 
 
@@ -287,8 +294,32 @@ def _stress(folder: Path) -> dict[str, Any]:
     return found
 
 
-def card_text(card: dict[str, Any]) -> str:
-    """Returns a card as Markdown."""
+def _traffic(name: str, folder: Path) -> dict[str, Any]:
+    """Returns what traffic the policy makes, as `cfx drive stress --traffic` measures it.
+
+    Raises:
+        DataError: it cannot be measured.
+    """
+    recorded = "acc" if "data.driver_type=acc" in RECIPES[name].overrides else "human"
+    with tempfile.TemporaryDirectory(prefix="cfx-") as temporary:
+        command = [sys.executable, "-m", "cfx", "drive", "stress", "--drivers", f"car={folder}"]
+        command += ["--recorded", recorded, "--step", TRAFFIC_STEP, "--traffic", temporary]
+        done = subprocess.run(command, check=False, stdout=subprocess.DEVNULL)  # noqa: S603
+        if done.returncode:
+            raise DataError(f"{folder}: its traffic was not measured; the words stand above")
+        written = Path(temporary, traffic_table.FILE).read_text(encoding="utf-8")
+    measured: dict[str, Any] = json.loads(written)
+    measured["command"] = measured["command"].replace(str(folder), f"cfx://{name}")
+    return measured
+
+
+def card_text(card: dict[str, Any], measured: dict[str, Any] | None = None) -> str:
+    """Returns a card as Markdown.
+
+    Args:
+        card: what `card.json` holds.
+        measured: what `traffic.json` holds; None: traffic was not measured.
+    """
     errors, safety, data = card["errors_on_unseen_drivers"], card["safety"], card["training_data"]
     low, high = errors["improvement_over_pooled_ci95"]
     lines = [
@@ -296,6 +327,7 @@ def card_text(card: dict[str, Any]) -> str:
         "",
         card["summary"],
         "",
+        *_purpose_lines(card),
         f"- **Model and policy**: {card['model']}, {card['policy']}",
         f"- **Training data**: {data['source']};"
         f" {data['pairs']} pairs of {data['drivers']} drivers",
@@ -318,6 +350,7 @@ def card_text(card: dict[str, Any]) -> str:
         f"- **Licence**: {card['licence']}",
         "",
         *_site_lines(card.get("sites", ())),
+        *(traffic_table.traffic_lines(measured) if measured else ()),
         "Made by",
         "",
         "```",
@@ -326,6 +359,17 @@ def card_text(card: dict[str, Any]) -> str:
         "",
     ]
     return "\n".join(lines)
+
+
+def _purpose_lines(card: dict[str, Any]) -> list[str]:
+    if card.get("for_traffic", True):
+        return []
+    return [
+        f"**It {traffic_table.NOT_FOR_TRAFFIC}.** The gaps that its drivers keep beyond that"
+        " recording's congestion are not people's: see Traffic. For roads full of vehicles take"
+        " `cfx://idm`.",
+        "",
+    ]
 
 
 def _expected_lines(expected: dict[str, float | None]) -> list[str]:

@@ -54,6 +54,11 @@ class Recipe(NamedTuple):
     summary: str
     recordings: tuple[str, ...] = (I80,)
 
+    @property
+    def is_for_traffic(self) -> bool:
+        """Whether it may fill roads; one congested recording says too little of free ones."""
+        return self.recordings != (I80,)
+
 
 RECIPES = {
     "idm": Recipe(
@@ -88,9 +93,6 @@ RECIPES = {
         (
             "experiment=every_road",
             "data.driver_type=acc",
-            "~data.site",
-            "+data.site={openacc?zalazone*: ZalaZone, openacc?vicolungo*: Vicolungo,"
-            " openacc*: Ispra}",
             *_ONE_NETWORK,
         ),
         "Intelligent Driver Model for cars with adaptive cruise control, without history and with.",
@@ -116,11 +118,11 @@ RECIPES = {
     ),
     "i80-idm": Recipe(
         ("experiment=unseen_drivers", "model=idm", *_I80),
-        "Intelligent Driver Model for unseen drivers; the smoothest, and the one to begin with.",
+        "Reproduces one recording, not for traffic: IDM, unseen drivers of I-80.",
     ),
     "i80-krauss": Recipe(
         ("experiment=unseen_drivers_smooth", "model.limits.response_time=0.3", *_I80),
-        "Krauss's model for unseen drivers, SUMO's own family.",
+        "Reproduces one recording, not for traffic: Krauss's model, unseen drivers of I-80.",
     ),
     "i80-w99": Recipe(
         (
@@ -130,7 +132,7 @@ RECIPES = {
             "model.limits.response_time=0.1",
             *_I80,
         ),
-        "Wiedemann 99 for unseen drivers, Vissim's family.",
+        "Reproduces one recording, not for traffic: Wiedemann 99, unseen drivers of I-80.",
     ),
     "i80-idm-stochastic": Recipe(
         (
@@ -142,12 +144,11 @@ RECIPES = {
             "protocol.history=0.0",
             *_I80,
         ),
-        "Intelligent Driver Model for unseen drivers who vary as people do: each draws their own"
-        " parameters and noise, with a seed.",
+        "Reproduces one recording, not for traffic: IDM, unseen drivers of I-80"
+        " who vary: each draws their own parameters and noise, with a seed.",
     ),
     "i80-idm-history": Recipe(
         ("experiment=conditioned", "model=idm", *_I80),
-        "Intelligent Driver Model for drivers with history: it observes a driver, then drives as"
-        " they do.",
+        "Reproduces one recording, not for traffic: IDM, drivers of I-80 with history.",
     ),
 }

@@ -10,6 +10,7 @@ import pytest
 from cfx.errors import ConfigError
 from cfx.policies.checkpoint import load_agent, save_agent
 from cfx.policies.ready import READY_FOLDER, card_of, names
+from cfx.policies.ready.traffic_table import traffic_of
 from cfx_report.benchmark import publish
 from cfx_report.benchmark.publish import card_text, make
 from cfx_report.benchmark.recipes import RECIPES
@@ -41,12 +42,15 @@ def test_a_finished_job_is_published_without_training(
     monkeypatch.setattr(publish, "READY_FOLDER", folder)
     stress = card_of(name)["stress"]
     monkeypatch.setattr(publish, "_stress", lambda _: stress)
+    measured = traffic_of(name)
+    monkeypatch.setattr(publish, "_traffic", lambda *_: measured)
     make([name], tmp_path / "not-needed.parquet", tmp_path / "work")
     card = json.loads((folder / name / "card.json").read_text())
     expected = card_of(name)
     for key in ("model", "errors_on_unseen_drivers", "safety", "valid_range", "command"):
         assert card[key] == expected[key]
-    assert (folder / name / "CARD.md").read_text() == card_text(card)
+    assert (folder / name / "CARD.md").read_text() == card_text(card, measured)
+    assert traffic_of(name) == json.loads((folder / name / "traffic.json").read_text())
 
 
 def test_an_unknown_recipe_is_one_sentence(tmp_path: Path) -> None:

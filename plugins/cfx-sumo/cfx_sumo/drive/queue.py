@@ -90,6 +90,11 @@ class QueueAtLight:
         return queue
 
     @property
+    def is_measured(self) -> bool:
+        """Whether more than `_STARTING` vehicles left a queue in one green."""
+        return any(len(green) > _STARTING for green in self.headways)
+
+    @property
     def _saturated(self) -> float:
         """The mean headway of the fifth vehicles and later, s."""
         return float(np.mean([one for green in self.headways for one in green[_STARTING:]]))

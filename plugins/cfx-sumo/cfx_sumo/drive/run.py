@@ -17,19 +17,23 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TextIO, Unpack
+from typing import TYPE_CHECKING, Any, NamedTuple, TextIO, Unpack
 from xml.etree import ElementTree
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
 from cfx.plugin import Task, files
 from cfx_sumo.drive.distributions import members_of
 from cfx_sumo.drive.left_out import left_out
+from cfx_sumo.drive.scenario_report import Observer, ScenarioReport, write_report
 from cfx_sumo.drive.scenarios import SCENARIOS
 from cfx_sumo.installed import require_sumo
-from cfx_sumo.live.driver import DriverOptions
+from cfx_sumo.live.driver import Driver, DriverOptions
 from cfx_sumo.live.fleet import Fleet
+from cfx_sumo.live.histories import WALKING_MPS
+from cfx_sumo.live.surroundings import View
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -43,6 +47,9 @@ _QUANTILES = (0.05, 0.5, 0.95)
 
 _DECIMALS = 6
 """Of the output's numbers: micrometres, however far a vehicle is from the origin."""
+
+_LANES_EVERY_S = 0.5
+"""s: lanes are looked at no more often, as SUMO has to be asked for each vehicle."""
 
 _LISTED = 10
 """Collisions, and vehicles left out, that the report lists."""
@@ -189,6 +196,7 @@ class ScenarioRun:
         crossings_of_sumo: how many of vehicles whose paths cross SUMO has in the same scenario
             where its own models drive all; None where there was nothing to compare with it.
         left_out: what SUMO says of the vehicles and flows of the scenario that it left out.
+        fleets: for each vType, in words, who drives its vehicles.
     """
 
     tallies: Mapping[str, Tally]
@@ -205,6 +213,7 @@ class ScenarioRun:
     collisions: Sequence[Collision] = ()
     crossings_of_sumo: int | None = None
     left_out: Sequence[str] = ()
+    fleets: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def real_time(self) -> float:
@@ -221,6 +230,7 @@ def run_scenario(
     end: float | None = None,
     step: float | None = None,
     output: Path | None = None,
+    report_to: Path | None = None,
     gui: bool = False,
     sumo_options: Sequence[str] = (),
     **options: Unpack[DriverOptions],
@@ -239,6 +249,8 @@ def run_scenario(
         end: s of simulated time.
         step: of the simulation, s; None: the scenario's, or that of the policies where it has none.
         output: a CSV file with a row for each driven vehicle and step.
+        report_to: a folder for flows, headways and time-space diagrams, beside those of the same
+            scenario with SUMO's own models (`cfx_sumo.drive.scenario_report`); None: none.
         gui: show SUMO's window, slowly enough to watch.
         sumo_options: more of SUMO's own options.
         options: as in `DriverOptions`; the seed is also SUMO's, without one it is the scenario's.
@@ -264,19 +276,31 @@ def run_scenario(
         with started(path, command, gui) as connection:
             log = Path(connection.simulation.getOption("error-log"))
             rows = _Rows.opened(stack, output, fleet) if output is not None else None
+            observer = None
+            if report_to is not None:
+                observer = Observer()
             try:
-                run = _Run(connection, fleet, path, rows, make_actor(), _name(scenario)).go(end)
+                driving = _Run(connection, fleet, path, rows, make_actor(), _name(scenario))
+                driving.observer = observer
+                run = driving.go(end)
             except OSError as error:
                 raise OutputError(
                     f"{output} cannot be written ({error.strerror or error}); name another --output"
                 ) from error
         run = replace(run, left_out=left_out(log))
         _check_on_the_road(run, path)
-        if not any(collision.crossing for collision in run.collisions):
+        has_crossings = any(collision.crossing for collision in run.collisions)
+        if not has_crossings and observer is None:
             return run
+        plain = Observer()
         command = command_line(path, sumo_options, step=step, seed=seed)
         with started(path, command, gui=False) as connection:
-            crossings = _crossings_of_sumo(connection, fleet, run.steps, make_actor())
+            crossings = _crossings_of_sumo(connection, fleet, run.steps, make_actor(), plain)
+        if observer is not None and report_to is not None:
+            both = ScenarioReport(observer.observations(), plain.observations())
+            write_report(both, report_to)
+        if not has_crossings:
+            return run
         return replace(run, crossings_of_sumo=crossings)
 
 
@@ -295,7 +319,9 @@ def _check_on_the_road(run: ScenarioRun, scenario: Path) -> None:
         )
 
 
-def _crossings_of_sumo(sumo: Any, fleet: Fleet, steps: int, actor: Actor | None) -> int:
+def _crossings_of_sumo(
+    sumo: Any, fleet: Fleet, steps: int, actor: Actor | None, observer: Observer
+) -> int:
     """Returns how many collisions of crossing paths a scenario has without drivers of cfx.
 
     Args:
@@ -303,6 +329,7 @@ def _crossings_of_sumo(sumo: Any, fleet: Fleet, steps: int, actor: Actor | None)
         fleet: whose vTypes count.
         steps: of the simulation.
         actor: acts on the simulation besides.
+        observer: looks at the vehicles.
     """
     total = 0
     before: set[tuple[str, str]] = set()
@@ -311,6 +338,7 @@ def _crossings_of_sumo(sumo: Any, fleet: Fleet, steps: int, actor: Actor | None)
             if actor is not None:
                 actor(sumo)
             sumo.simulationStep()
+            observer.look(sumo)
             touching = set()
             for found in sumo.simulation.getCollisions():
                 driven = fleet.has_type(found.colliderType) or fleet.has_type(found.victimType)
@@ -497,6 +525,32 @@ def _reason(error: Exception) -> str:
     return said
 
 
+class _Motions(NamedTuple):
+    """What vehicles of a driver do, `(D,)` each; SI units.
+
+    Attributes:
+        names: of the vehicles.
+        speed, acceleration: theirs.
+        behind: how many the model drives behind a leader.
+        time_gaps: of those that are faster than walking, s.
+    """
+
+    names: list[str]
+    speed: NDArray[np.float64]
+    acceleration: NDArray[np.float64]
+    behind: int
+    time_gaps: NDArray[np.float64]
+
+    @classmethod
+    def of_view(cls, names: list[str], view: View) -> _Motions:
+        """Returns what a driver has seen of all of its vehicles."""
+        speed, behind = view.seen.speed.numpy(), len(view.following)
+        gap = view.seen.gap.numpy()[:behind]
+        moves = speed[:behind] > WALKING_MPS
+        time_gaps = gap[moves] / speed[:behind][moves]
+        return cls(names, speed, view.seen.acceleration.numpy(), behind, time_gaps)
+
+
 class _Run:
     """One run of a scenario."""
 
@@ -517,7 +571,10 @@ class _Run:
         self._rows = rows
         self._tallies = {name: Tally() for name in fleet.drivers}
         self._type_of: dict[str, str] = {}
-        self._lanes: dict[str, tuple[str, int]] = {}
+        self._lanes: dict[str, str] = {}
+        self._lanes_next = -math.inf
+        self._counted: Mapping[str, str] | None = None
+        self._names: dict[str, list[str]] = {}
         self._braking: set[str] = set()
         self._collisions: list[Collision] = []
         self._touching: dict[tuple[str, str], Collision] = {}
@@ -525,6 +582,7 @@ class _Run:
         self._steps = 0
         self._others = 0
         self._most = 0
+        self.observer: Observer | None = None
         self._check_types()
         self._name_members()
 
@@ -586,7 +644,7 @@ class _Run:
                 self._tallies[collision.kind].collisions += 1
             else:
                 self._tallies[collision.kind].below_min_gap += 1
-        limited, changed, outside, recorded, expected = {}, {}, {}, {}, {}
+        limited, changed, outside, recorded, expected, fleets = {}, {}, {}, {}, {}, {}
         for name, driver in self._fleet.drivers.items():
             limited[name] = driver.counts.limited / max(1, driver.counts.steps)
             changed[name] = driver.counts.changed / max(1, driver.counts.told)
@@ -595,6 +653,7 @@ class _Run:
             recorded[name] = trained_on.quantiles
             error = trained_on.expected_error
             expected[name] = "" if error is None else error.of_unseen_in_words()
+            fleets[name] = driver.fleet_in_words()
         return ScenarioRun(
             self._tallies,
             self._steps,
@@ -608,6 +667,7 @@ class _Run:
             recorded,
             expected,
             self._collisions,
+            fleets=fleets,
         )
 
     def _last(self, end: float | None) -> float:
@@ -624,36 +684,87 @@ class _Run:
         """Notes what the last step did, and writes it down."""
         self._steps += 1
         vehicles = self._fleet.vehicles
-        self._type_of |= vehicles
-        for name, kind in vehicles.items():
-            self._count(name, kind, dt)
-        self._count_motions()
+        if vehicles is not self._counted:
+            self._counted, self._names = vehicles, self._by_kind(vehicles)
+            self._type_of |= vehicles
+            for kind, names in self._names.items():
+                self._tallies[kind].vehicles.update(names)
+        for kind, names in self._names.items():
+            self._count(kind, names, dt)
+        self._count_lanes(vehicles)
         self._count_teleports()
+        if self.observer is not None:
+            self.observer.look(self._sumo)
         if self._rows is not None:
             self._rows.write(self._sumo, self._fleet)
         self._others = max(self._others, self._sumo.vehicle.getIDCount() - len(vehicles))
         self._most = max(self._most, len(vehicles))
 
-    def _count(self, name: str, kind: str, dt: float) -> None:
-        """Notes what the last step did to a vehicle of the fleet."""
-        vehicle, tally = self._sumo.vehicle, self._tallies[kind]
-        tally.vehicles.add(name)
-        tally.steps += 1
-        tally.metres += vehicle.getSpeed(name) * dt
-        if self._fleet.drivers[kind].follows(name):
-            tally.behind += 1
-        lane = vehicle.getRoadID(name), vehicle.getLaneIndex(name)
-        before = self._lanes.get(name, lane)
-        if before[0] == lane[0] and before[1] != lane[1]:
-            tally.lane_changes += 1
-        self._lanes[name] = lane
-        acceleration = vehicle.getAcceleration(name)
-        tally.hardest_braking = max(tally.hardest_braking, -acceleration)
-        if acceleration >= -self._own_decel(name) - 1e-6:
-            self._braking.discard(name)
-        elif name not in self._braking:
-            self._braking.add(name)
-            tally.hard_brakings += 1
+    def _by_kind(self, vehicles: Mapping[str, str]) -> dict[str, list[str]]:
+        """Returns the vehicles of each vType that has some."""
+        names: dict[str, list[str]] = {}
+        for name, kind in vehicles.items():
+            names.setdefault(kind, []).append(name)
+        return names
+
+    def _count(self, kind: str, names: list[str], dt: float) -> None:
+        """Notes what the last step did to the vehicles of a vType."""
+        tally, motions = self._tallies[kind], self._motions(self._fleet.drivers[kind], names)
+        speed, acceleration = motions.speed, motions.acceleration
+        tally.steps += len(names)
+        tally.behind += motions.behind
+        tally.metres += float(speed.sum()) * dt
+        tally.hardest_braking = max(tally.hardest_braking, -float(acceleration.min()))
+        tally.speeds.add(speed)
+        tally.accelerations.add(acceleration)
+        tally.braking.add((-acceleration).clip(min=0.0))
+        tally.time_gaps.add(motions.time_gaps)
+        brakes = set()
+        for number in (acceleration < 0.0).nonzero()[0].tolist():
+            name = motions.names[number]
+            if acceleration[number] < -self._own_decel(name) - 1e-6:
+                brakes.add(name)
+        tally.hard_brakings += len(brakes - self._braking)
+        if self._braking:
+            self._braking -= set(names)
+        self._braking |= brakes
+
+    def _motions(self, driver: Driver, names: list[str]) -> _Motions:
+        """Returns what vehicles of a driver do.
+
+        The driver has just looked at them, unless it has taken no step of its model. SUMO is asked
+        again only then, or where vehicles of other vTypes have the same driver.
+        """
+        view = driver.looked_at()
+        if view is not None and len(view.order) == len(names):
+            looked = [*view.following, *view.alone]
+            if set(looked) == set(names):
+                return _Motions.of_view(looked, view)
+        vehicle = self._sumo.vehicle
+        motions = []
+        for name in names:
+            motions.append((vehicle.getSpeed(name), vehicle.getAcceleration(name)))
+        speed, acceleration = np.array(motions, dtype=np.float64).T
+        behind = sum(1 for name in names if driver.follows(name))
+        return _Motions(names, speed, acceleration, behind, driver.time_gaps(names).numpy())
+
+    def _count_lanes(self, vehicles: Mapping[str, str]) -> None:
+        """Counts changes of lane on the same edge; they are looked for now and then."""
+        now = self._sumo.simulation.getTime()
+        if now < self._lanes_next - 1e-6:
+            return
+        self._lanes_next = now + _LANES_EVERY_S
+        lane_of, lanes, before = self._sumo.vehicle.getLaneID, {}, self._lanes
+        for name, kind in vehicles.items():
+            lanes[name] = lane = lane_of(name)
+            last = before.get(name, lane)
+            if lane == last:
+                continue
+            edge, _, index = lane.rpartition("_")
+            last_edge, _, last_index = last.rpartition("_")
+            if edge and edge == last_edge:
+                self._tallies[kind].lane_changes += abs(int(index) - int(last_index))
+        self._lanes = lanes
 
     def _own_decel(self, name: str) -> float:
         """Returns the `decel` of a vehicle's vType, m/s2, whatever drivers make of it meanwhile."""
@@ -661,24 +772,6 @@ class _Run:
             kind = self._sumo.vehicle.getTypeID(name).partition("@")[0]
             self._decel[name] = float(self._sumo.vehicletype.getDecel(kind))
         return self._decel[name]
-
-    def _count_motions(self) -> None:
-        """Notes speeds, accelerations and time gaps of all vehicles of the fleet."""
-        vehicle = self._sumo.vehicle
-        motions: dict[str, list[tuple[float, float]]] = {name: [] for name in self._tallies}
-        for name, kind in self._fleet.vehicles.items():
-            motions[kind].append((vehicle.getSpeed(name), vehicle.getAcceleration(name)))
-        for kind, pairs in motions.items():
-            if not pairs:
-                continue
-            values = np.array(pairs)
-            tally = self._tallies[kind]
-            tally.speeds.add(values[:, 0])
-            tally.accelerations.add(values[:, 1])
-            tally.braking.add((-values[:, 1]).clip(min=0.0))
-        for kind, driver in self._fleet.drivers.items():
-            names = [name for name, its in self._fleet.vehicles.items() if its == kind]
-            self._tallies[kind].time_gaps.add(driver.time_gaps(names).numpy())
 
     def _note_collisions(self, dt: float) -> None:
         """Notes the collisions that SUMO reports after a step; one that goes on is one."""
@@ -834,6 +927,8 @@ def report(run: ScenarioRun) -> None:
             f"Collisions of vehicles whose paths cross at a junction: {crossings}; where SUMO's own"
             f" models drive all of them in the same scenario: {run.crossings_of_sumo}"
         )
+    for name, words in run.fleets.items():
+        print(f"{name}: {words}")
     for name, words in run.expected.items():
         if words:
             print(f"{name}: {words}")

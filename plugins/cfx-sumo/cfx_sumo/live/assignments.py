@@ -13,6 +13,7 @@ from torch import Tensor
 
 from cfx.errors import DataError, ParameterError
 from cfx.plugin import ANY_DRIVER, Agent, base_of
+from cfx_sumo.live.draws import uniform_of_vehicles
 from cfx_sumo.live.vehicles import VehicleTable
 
 
@@ -23,13 +24,18 @@ class Assignments:
         policy: whose networks drive.
         network: which of them drives vehicles that nothing is said of; None: none does.
         source: where the policy comes from, for messages.
+        seed: of which of the recorded drivers each vehicle has, where nothing is said of it; None:
+            all have the average one.
 
     Raises:
         DataError: the policy has no such network.
     """
 
-    def __init__(self, policy: Agent, network: str | None, source: str) -> None:
+    def __init__(
+        self, policy: Agent, network: str | None, source: str, seed: int | None = None
+    ) -> None:
         self._policy = policy
+        self._seed = seed
         self._source = source
         self._default = None
         if network is not None:
@@ -74,6 +80,9 @@ class Assignments:
         if self._policy.base is not None:
             table.base[rows] = self._policy.base[table.network[rows]].to(table.base)
         table.driver_features[rows] = torch.nan
+        drivers = self._policy.trained_on.drivers
+        if self._seed is not None and drivers is not None:
+            table.driver_features[rows] = drivers.drawn(uniform_of_vehicles(self._seed, names))
         for row, name in zip(rows.tolist(), names, strict=True):
             if name in self._bases:
                 table.base[row] = torch.tensor(self._bases[name], dtype=torch.float64)

@@ -34,12 +34,27 @@ def standard_normal(seed: int, vehicles: Sequence[str], now: float, count: int) 
     Returns:
         `(D, k)`, each standard normal and independent of the others.
     """
-    milliseconds = round(1000 * now)
+    uniform = _uniform(f"{seed}/{round(1000 * now)}", vehicles, count)
+    normal: Tensor = torch.special.ndtri(uniform)
+    return normal
+
+
+def uniform_of_vehicles(seed: int, vehicles: Sequence[str]) -> Tensor:
+    """Draws a number from 0 to 1 for each vehicle, `(D,)`: who drives it, at any time.
+
+    Args:
+        seed: any integer.
+        vehicles: their ids, D of them.
+    """
+    return _uniform(f"{seed}/driver", vehicles, 1)[:, 0]
+
+
+def _uniform(about: str, vehicles: Sequence[str], count: int) -> Tensor:
+    """Returns numbers between 0 and 1 that depend on these words and each vehicle's id."""
     drawn = bytearray()
     for vehicle in vehicles:
-        words = f"{seed}/{milliseconds}/{vehicle}".encode()
+        words = f"{about}/{vehicle}".encode()
         drawn += hashlib.shake_128(words).digest(_BYTES * count)
     whole = np.frombuffer(bytes(drawn), dtype="<u8") >> (64 - _BITS)
     uniform = (whole.astype(np.float64) + 0.5) * 2.0**-_BITS
-    normal: Tensor = torch.special.ndtri(torch.from_numpy(uniform))
-    return normal.reshape(len(vehicles), count)
+    return torch.from_numpy(uniform).reshape(len(vehicles), count)

@@ -29,6 +29,7 @@ from cfx.plugin import (
     registry,
     require_no_further_signals,
     threads,
+    traffic_table,
 )
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
@@ -65,11 +66,15 @@ class DriverOptions(TypedDict, total=False):
             lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
         seed: of what a stochastic policy leaves to chance: what is drawn for a vehicle depends on
             it, the vehicle's id and the simulated time alone; None: nothing is drawn.
+        average: every vehicle has the same driver, the average one; otherwise each draws, by the
+            seed and its id, one of the recorded drivers whom the policy learned from, where it
+            knows them (`TrainedOn.drivers`).
     """
 
     look_ahead: float
     speed_mode: int
     seed: int | None
+    average: bool
 
 
 class Driver:
@@ -126,6 +131,7 @@ class Driver:
         model: DrivingModel | None = None,
         source: str = "this policy",
         seed: int | None = 0,
+        average: bool = False,
     ) -> None:
         """Makes a driver.
 
@@ -138,7 +144,8 @@ class Driver:
                 lights, stops and junctions and keeps SUMO's safe gap; 0 does none of it.
             model: the driving model; None for the one that the policy was trained for.
             source: where the policy comes from, for messages.
-            seed: of what a stochastic policy leaves to chance, as in `DriverOptions`.
+            seed: of what is left to chance, as in `DriverOptions`.
+            average: whether every vehicle has the same driver, as in `DriverOptions`.
 
         Raises:
             DataError: `look_ahead` is no distance; the policy has no such network; or its driving
@@ -156,7 +163,9 @@ class Driver:
         self.model = model or cast(DrivingModel, registry.create("model", policy.model_node))
         check_model(self.model, policy.model_node["name"], source)
         self.counts = DriveCounts()
-        self._assignments = Assignments(policy, network, source)
+        of_drivers = None if average else seed
+        self._draws_drivers = of_drivers is not None
+        self._assignments = Assignments(policy, network, source, of_drivers)
         self._vehicles = KnownVehicles(policy, policy.core.head.driven_model(self.model))
         self._histories = Histories(self._vehicles)
         self._windows = PolicyWindows(policy, self._vehicles, self._assignments, seed)
@@ -168,6 +177,7 @@ class Driver:
         self._swept = math.nan
         self._now = -math.inf
         self._clock: Clock | None = None
+        self._view: View | None = None
 
     @classmethod
     def load(
@@ -282,10 +292,36 @@ class Driver:
         """Returns how much was driven outside what the policy has learned, in words; or ""."""
         return self.counts.outside_in_words(self.policy)
 
+    def fleet_in_words(self) -> str:
+        """Returns who drives the vehicles: recorded drivers, or the average one; and for what."""
+        drivers = self.policy.trained_on.drivers
+        words = (
+            "all vehicles have one average driver; the policy knows no recorded ones"
+            " (policy.driver_features=all trains one that does)"
+        )
+        if drivers is not None and self._draws_drivers:
+            words = (
+                f"each vehicle draws one of {len(drivers.weight)} recorded drivers, by its id and"
+                " the seed"
+            )
+        elif drivers is not None:
+            words = "all vehicles have one average driver"
+        if traffic_table.is_for_traffic(self.source):
+            return words
+        return f"{words}. {self.source} {traffic_table.NOT_FOR_TRAFFIC}"
+
     def time_gaps(self, vehicles: Iterable[str]) -> Tensor:
         """Returns the time gaps of those that the model drives faster than walking, `(d,)`, s."""
         following = (name for name in vehicles if self.follows(name))
         return self._histories.time_gaps(self._vehicles.rows(following))
+
+    def looked_at(self) -> View | None:
+        """Returns what the last call of `step` saw, if it drove all vehicles that it was given.
+
+        None before the first call, after one that watched, and in steps shorter than the policy's,
+        between two of which vehicles hold their acceleration.
+        """
+        return self._view
 
     def gap_to(self, vehicle: str, leader: str) -> float | None:
         """Returns the gap at the last step, bumper to bumper, m; None behind another or nobody."""
@@ -359,6 +395,7 @@ class Driver:
             between = list(compress(names, (early & (times != now)).tolist()))
             names, rows = list(compress(names, (~early).tolist())), rows[~early]
         view = look(connection, names, self.look_ahead)
+        self._view = view if drive and not between else None
         rows = rows[view.order]
         if drive:
             self._hold(connection, between, now, clock)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Unpack
 
@@ -39,6 +39,9 @@ class Fleet:
             raise DataError("a fleet needs a driver for at least one vType")
         self.drivers = dict(drivers)
         self._type_of: dict[str, str] = {}
+        self._ids: tuple[str, ...] | None = None
+        self._driven: dict[str, str] | None = None
+        self._vehicles_of: dict[int, list[str]] = {}
         self._member_of: dict[str, str] = {}
 
     def add_members(self, name: str, vtypes: Iterable[str]) -> None:
@@ -50,6 +53,7 @@ class Fleet:
         """
         for vtype in vtypes:
             self._member_of[vtype] = name
+        self._ids = None
 
     @classmethod
     def load(
@@ -77,7 +81,10 @@ class Fleet:
     @property
     def vehicles(self) -> dict[str, str]:
         """The vType of each vehicle of the fleet that was on the road at the last step."""
-        return {vehicle: name for vehicle, name in self._type_of.items() if name in self.drivers}
+        if self._driven is None:
+            types = self._type_of.items()
+            self._driven = {vehicle: name for vehicle, name in types if name in self.drivers}
+        return self._driven
 
     @torch.no_grad()
     @threads.one_thread()
@@ -89,18 +96,12 @@ class Fleet:
         Raises:
             SumoError: as `Driver.step` does.
         """
-        types: dict[str, str] = {}
-        departed = set(connection.simulation.getDepartedIDList())
-        for vehicle in connection.vehicle.getIDList():
-            known = self._type_of.get(vehicle)
-            if known is None or vehicle in departed:
-                known = self._name_of(connection.vehicle.getTypeID(vehicle))
-            types[vehicle] = known
-        self._type_of = types
-        vehicles: dict[int, list[str]] = {id(driver): [] for driver in self._each_driver()}
-        for vehicle, name in types.items():
-            if name in self.drivers:
-                vehicles[id(self.drivers[name])].append(vehicle)
+        departed = connection.simulation.getDepartedIDList()
+        ids = connection.vehicle.getIDList()
+        # Mostly the same vehicles are on the road as at the last step.
+        if departed or ids != self._ids:
+            self._sort(connection, ids, set(departed))
+        vehicles = self._vehicles_of
         together: Together | None = {} if len(vehicles) > 1 else None
         turns = [
             driver.in_turns(connection, vehicles[id(driver)], together)
@@ -108,6 +109,24 @@ class Fleet:
         ]
         while turns:
             turns = [turn for turn in turns if next(turn, _DONE) is not _DONE]
+
+    def _sort(
+        self, connection: Connection, ids: tuple[str, ...], departed: Collection[str]
+    ) -> None:
+        """Finds the vType and the driver of each vehicle on the road."""
+        types: dict[str, str] = {}
+        for vehicle in ids:
+            known = self._type_of.get(vehicle)
+            if known is None or vehicle in departed:
+                known = self._name_of(connection.vehicle.getTypeID(vehicle))
+            types[vehicle] = known
+        self._ids, self._type_of = ids, types
+        self._driven = None
+        vehicles: dict[int, list[str]] = {id(driver): [] for driver in self._each_driver()}
+        for vehicle, name in types.items():
+            if name in self.drivers:
+                vehicles[id(self.drivers[name])].append(vehicle)
+        self._vehicles_of = vehicles
 
     def has_type(self, vtype: str) -> bool:
         """Says whether the fleet drives vehicles of a vType of SUMO's."""
@@ -142,7 +161,7 @@ class Fleet:
             )
         for driver, record in zip(drivers, records, strict=True):
             driver.go_on(connection, record, str(path))
-        self._type_of = types
+        self._type_of, self._ids, self._driven = types, None, None
 
     def _each_driver(self) -> list[Driver]:
         """Returns each driver once, in the order of their types."""

@@ -16,7 +16,7 @@ from cfx_sumo.live.vehicles import KnownVehicles
 _LEADER_SPEED, _LEADER_ACCELERATION, _SPEED, _ACCELERATION, _GAP = range(len(OBSERVED))
 """Rows of a history."""
 
-_WALKING_MPS = 1.5
+WALKING_MPS = 1.5
 """Speed below which a time gap means nothing."""
 
 
@@ -91,7 +91,7 @@ class Histories:
     def time_gaps(self, rows: Tensor) -> Tensor:
         """Returns the time gaps of those that were faster than walking, `(d,)`, s."""
         frame = self._vehicles.table.history[rows, :, -1]
-        return (frame[:, _GAP] / frame[:, _SPEED])[frame[:, _SPEED] > _WALKING_MPS]
+        return (frame[:, _GAP] / frame[:, _SPEED])[frame[:, _SPEED] > WALKING_MPS]
 
     def gap(self, row: int) -> float:
         """Returns the gap of a vehicle at its last frame, m."""

@@ -13,6 +13,16 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+__all__ = [
+    "LEAST_STD",
+    "MOST_LAG_S",
+    "PairWaves",
+    "RingWaves",
+    "pair_waves",
+    "ring_waves",
+]
+"""What plugins may use, as `cfx.plugin.waves`."""
+
 MOST_LAG_S = 8.0
 """A wave takes at most this long from a vehicle to the one behind it."""
 

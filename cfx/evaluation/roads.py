@@ -17,19 +17,30 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from cfx.plugin import (
-    OBSERVED,
-    Agent,
-    AgentState,
-    DrivingModel,
-    Follower,
-    Leader,
-    MemoryStepper,
-    Start,
-    composed,
-    require_no_further_signals,
-    threads,
-)
+from cfx.core import threads
+from cfx.data.signals import OBSERVED
+from cfx.models import composed
+from cfx.models.base import DrivingModel, Follower, Leader
+from cfx.policies.agent import Agent, AgentState
+from cfx.policies.inputs import require_no_further_signals
+from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.trajectory import Start
+
+__all__ = [
+    "FREE_M",
+    "START_HEADWAY",
+    "Bottleneck",
+    "Driven",
+    "Lanes",
+    "Road",
+    "RoadKind",
+    "joined",
+    "open_roads",
+    "platoons",
+    "ring_roads",
+    "simulate_roads",
+]
+"""What plugins may use, as `cfx.plugin.roads`."""
 
 RoadKind = Literal["ring", "open", "platoon"]
 
@@ -327,6 +338,7 @@ def simulate_roads(
     lanes: Lanes,
     seconds: float,
     generator: torch.Generator | None = None,
+    pace: Tensor | None = None,
 ) -> Driven:
     """Simulates all vehicles of all roads with an agent that drives each of them.
 
@@ -341,6 +353,8 @@ def simulate_roads(
         seconds: how long; whole windows are simulated.
         generator: draws, on the CPU, what a stochastic agent leaves to chance; None: nothing is
             drawn.
+        pace: m/s that vehicles which keep their speed are faster after each time step than at the
+            start, `(S,)`; afterwards as at its end. None: nothing.
     """
     require_no_further_signals(agent.core.inputs, "simulated traffic")
     dt, windows = agent.dt, agent.windows
@@ -353,6 +367,10 @@ def simulate_roads(
     min_gap = ahead.position - ahead.length - follower.position
     outside = torch.zeros_like(min_gap)
     count = max(1, round(seconds / (windows.stride * dt)))
+    steps = count * windows.stride
+    if pace is None:
+        pace = lanes.speed.new_zeros(1)
+    paces = iter(pace[torch.arange(steps, device=pace.device).clamp(max=len(pace) - 1)])
     for _ in range(count):
         history = {}
         for number, name in enumerate(OBSERVED):
@@ -366,7 +384,8 @@ def simulate_roads(
                 ahead.position[None], ahead.speed[None], ahead.acceleration[None], ahead.length
             )
             moved, _, _ = stepper.advance(follower, now, p)
-            follower = _kept_steady(moved, follower, lanes.steady, dt)
+            kept = lanes.speed + next(paces)
+            follower = _kept_steady(moved, follower, kept, lanes.steady, dt)
             ahead = lanes.leader(follower)
             seen.append(_seen(follower, ahead))
             min_gap = torch.minimum(min_gap, seen[-1][-1])
@@ -387,10 +406,12 @@ def _seen(follower: Follower, ahead: Leader) -> tuple[Tensor, ...]:
     return ahead.speed, ahead.acceleration, follower.speed, follower.acceleration, gap
 
 
-def _kept_steady(moved: Follower, before: Follower, steady: Tensor, dt: float) -> Follower:
-    """Returns vehicles after a step, of which some have kept their speed."""
+def _kept_steady(
+    moved: Follower, before: Follower, kept: Tensor, steady: Tensor, dt: float
+) -> Follower:
+    """Returns vehicles after a step, of which some drive at speeds `(D,)` that they keep."""
     return moved._replace(
-        position=torch.where(steady, before.position + before.speed * dt, moved.position),
-        speed=torch.where(steady, before.speed, moved.speed),
-        acceleration=torch.where(steady, 0.0, moved.acceleration),
+        position=torch.where(steady, before.position + kept * dt, moved.position),
+        speed=torch.where(steady, kept, moved.speed),
+        acceleration=torch.where(steady, (kept - before.speed) / dt, moved.acceleration),
     )

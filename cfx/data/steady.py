@@ -1,0 +1,200 @@
+"""Steady following: where a recording shows at which gap drivers settle, by speed.
+
+A driver follows steadily while the leader is as fast as they are and they hardly accelerate. The
+flow of such traffic is the speed over the spacing, so the recorded relation of speed and gap is
+the one that a fleet of drivers has to have (M. Treiber and A. Kesting, 2013, *Traffic Flow
+Dynamics*, Springer, chapter 4).
+
+Shapes: P pairs, T frames, K ranges of speed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from cfx.data.pairs import PairBatch, PairSet
+
+__all__ = [
+    "EDGES_MPS",
+    "VEHICLE_M",
+    "GapRelation",
+    "SteadyFollowing",
+    "flow",
+    "relation_from",
+    "relation_of",
+    "relations_of_types",
+    "steady_following",
+]
+"""What plugins may use, as `cfx.plugin.steady`."""
+
+EDGES_MPS = (0.5, 3.0, 6.0, 9.0, 12.0, 16.0, 20.0, 25.0, 30.0, 40.0)
+"""m/s: the ranges of speed in which gaps are averaged, wider where recordings are fewer."""
+
+VEHICLE_M = 4.8
+"""m: length of a vehicle where flows are computed from gaps."""
+
+RELATIVE_SPEED_MPS = 0.5
+ACCELERATION_MPS2 = 0.4
+"""Below both of them a driver follows steadily."""
+
+LEAST_S = 3.0
+"""s: how long a pair has to follow steadily in a range of speed to count in it."""
+
+Floats = NDArray[np.float64]
+
+
+class SteadyFollowing(NamedTuple):
+    """Mean steady following of each pair in each range of speed, `(P, K)` each.
+
+    Attributes:
+        speed: m/s; NaN where a pair followed steadily for less than `LEAST_S`, as the gap.
+        gap: bumper to bumper, m.
+        seconds: how long each followed steadily.
+    """
+
+    speed: Tensor
+    gap: Tensor
+    seconds: Tensor
+
+
+class GapRelation(NamedTuple):
+    """The gap that drivers keep, by speed: a row for each range with enough of them, `(K,)` each.
+
+    Attributes:
+        speed: m/s, in the mean.
+        gap: that of the mean spacing, bumper to bumper, m: a lane with all these drivers has that
+            flow.
+        low, median, high: 25, 50 and 75 % of drivers' gaps, each moved to that speed at the
+            driver's own time headway, m.
+        drivers: how many there are.
+    """
+
+    speed: Floats
+    gap: Floats
+    low: Floats
+    median: Floats
+    high: Floats
+    drivers: NDArray[np.int64]
+
+    def columns(self) -> dict[str, list[float]]:
+        """Returns the columns as lists of numbers."""
+        return {name: np.round(getattr(self, name), 3).tolist() for name in self._fields}
+
+    def gap_at(self, speed: Floats) -> Floats:
+        """Returns the gap of the mean spacing at speeds, m; NaN outside of the recorded ones."""
+        if not len(self.speed):
+            return np.full_like(speed, np.nan)
+        return np.interp(speed, self.speed, self.gap, left=np.nan, right=np.nan)
+
+
+def flow(speed: Floats, gap: Floats) -> Floats:
+    """Returns the flow of vehicles that all drive at a speed, m/s, and a gap, m: vehicles/h."""
+    return 3600.0 * speed / (gap + VEHICLE_M)
+
+
+def steady_following(batch: PairBatch, counted: Tensor | None = None) -> SteadyFollowing:
+    """Averages the steady following of each pair.
+
+    Args:
+        batch: P pairs.
+        counted: which frames may be used, bool `(P, T)`; None: all.
+    """
+    import torch
+
+    speed, gap = batch.follower_speed, batch.gap
+    is_steady = batch.mask & ((batch.leader_speed - speed).abs() < RELATIVE_SPEED_MPS)
+    is_steady &= batch.follower_acceleration.abs() < ACCELERATION_MPS2
+    if counted is not None:
+        is_steady &= counted
+    edges = torch.tensor(EDGES_MPS, dtype=speed.dtype, device=speed.device)
+    place = torch.bucketize(speed, edges, right=True) - 1
+    is_steady &= (place >= 0) & (place < len(edges) - 1)
+    place = place.clamp(0, len(edges) - 2)
+    weight = is_steady.to(torch.float64)
+    sums = []
+    for values in (weight, weight * speed.double(), weight * gap.double()):
+        total = weight.new_zeros((len(batch), len(edges) - 1))
+        sums.append(total.scatter_add_(1, place, values))
+    frames = sums[0]
+    is_long = frames * batch.dt >= LEAST_S
+    means = []
+    for total in sums[1:]:
+        means.append(torch.where(is_long, total / frames.clamp(min=1.0), torch.nan))
+    return SteadyFollowing(means[0], means[1], frames * batch.dt)
+
+
+def relation_of(
+    following: SteadyFollowing, drivers: Sequence[str], weight: Floats | None = None, least: int = 3
+) -> GapRelation:
+    """Returns the relation of speed and gap of some drivers.
+
+    Drivers of one range differ in speed, so their time headways (front to front) are compared.
+
+    Args:
+        following: of P pairs.
+        drivers: whose pair each is; all pairs of a driver together count once.
+        weight: of each pair, `(P,)`; None: all drivers alike.
+        least: drivers that a range needs to be listed.
+    """
+    speeds, gaps = following.speed.cpu().numpy(), following.gap.cpu().numpy()
+    _, driver = np.unique(np.asarray(drivers), return_inverse=True)
+    shares = 1.0 / np.bincount(driver)[driver] if weight is None else weight
+    rows: list[tuple[float, ...]] = []
+    for place in range(speeds.shape[1]):
+        known = np.isfinite(speeds[:, place])
+        listed = len(np.unique(driver[known]))
+        if listed < max(1, least):
+            continue
+        mean_speed = float(np.average(speeds[known, place], weights=shares[known]))
+        headway = (gaps[known, place] + VEHICLE_M) / speeds[known, place]
+        quartiles = np.quantile(
+            headway, (0.25, 0.5, 0.75), method="inverted_cdf", weights=shares[known]
+        )
+        mean = float(np.average(headway, weights=shares[known]))
+        gaps_there = np.array([mean, *quartiles]) * mean_speed - VEHICLE_M
+        rows.append((mean_speed, *gaps_there.tolist(), listed))
+    speed, gap, low, median, high, count = np.array(rows, dtype=np.float64).reshape(-1, 6).T
+    return GapRelation(speed, gap, low, median, high, count.astype(np.int64))
+
+
+def relations_of_types(pairs: PairSet) -> dict[str, GapRelation]:
+    """Returns the relation of speed and gap of each type of driver.
+
+    Args:
+        pairs: recordings of people, of cars with adaptive cruise control, or of both; a type has
+            the name that they give it, "" where they say nothing.
+    """
+    from cfx.data.pairs import PairBatch
+
+    following = steady_following(PairBatch.of(pairs))
+    drivers = pairs.drivers
+    relations = {}
+    for kind in sorted({pair.driver_type for pair in pairs}):
+        rows, names = [], []
+        for number, pair in enumerate(pairs):
+            if pair.driver_type == kind:
+                rows.append(number)
+                names.append(drivers[number])
+        of_kind = SteadyFollowing(*(values[rows] for values in following))
+        relations[kind] = relation_of(of_kind, names)
+    return relations
+
+
+def relation_from(table: Mapping[str, Sequence[float]]) -> GapRelation:
+    """Returns a relation from its columns, as `GapRelation.columns` gives them.
+
+    Raises:
+        KeyError: a column is missing.
+    """
+    speed, gap, low, median, high = (
+        np.asarray(table[name], dtype=np.float64) for name in GapRelation._fields[:-1]
+    )
+    drivers = np.asarray(table["drivers"], dtype=np.int64)
+    return GapRelation(speed, gap, low, median, high, drivers)
