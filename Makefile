@@ -6,6 +6,7 @@
 #   make golden | make golden-write           compare the results of small jobs, bit for bit, with recorded ones | record them anew
 #   make settings [EVERY=20]                  each setting of each option changes what a job writes, or is refused (every 20th alone)
 #   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
+#   make hostile [FILES=1000]                 hostile but plausible recordings: read as they are meant, or refused with the reason
 #   make mutants [MUTANTS=300 SEED=0 ROOMS="calibration simulation"]   change the code at random; what no test of its room notices
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
 #   make policies                             train the ready-made policies anew from ../shared/data (two hours)
@@ -29,7 +30,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow golden golden-write settings fuzz mutants kills bench policies docs tutorials dist beside conf lock clean
+.PHONY: run test test-slow golden golden-write settings fuzz hostile mutants kills bench policies docs tutorials dist beside conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -51,6 +52,9 @@ settings: $(VENV)/.ready-test
 
 fuzz: $(VENV)/.ready-test
 	CFX_FUZZ_EXAMPLES=$(or $(EXAMPLES),5000) CFX_FAULTS_STRIDE=1 $(BIN)/python -m pytest tests/fuzz --timeout 0 -n auto
+
+hostile: $(VENV)/.ready-test
+	$(BIN)/python -m tests.benchmarks.hostile_files --files $(or $(FILES),1000) --data $(DATA)
 
 # Goes on where it was interrupted; a mutant takes as long as its room's tests at most, three times as long where it hangs.
 mutants: $(VENV)/.ready-test

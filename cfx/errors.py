@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import difflib
+import os
 import re
+import traceback
 from collections.abc import Iterable
 
 
@@ -97,10 +99,31 @@ def first_line(error: BaseException) -> str:
     return next((line for line in lines if line), type(error).__name__)
 
 
+_OF_MANY = re.compile(
+    r"Boolean value of Tensor|elements? tensors can be converted|cannot be converted to Scalar"
+)
+"""What PyTorch says where Python asks a tensor of many values for one."""
+
+
 def in_words(error: BaseException) -> str:
-    """Returns an error's type and the first line of its text."""
+    """Returns an error's type and the first line of its text.
+
+    Of an `if`, a `max` or a `float` of a tensor it says where it stands, and what to write.
+    """
     first = next(iter(str(error).splitlines()), "")
-    return f"{type(error).__name__}: {first}".rstrip(": ")
+    words = f"{type(error).__name__}: {first}".rstrip(": ")
+    if not _OF_MANY.search(first):
+        return words
+    torch = f"{os.sep}torch{os.sep}"
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if torch not in frame.filename:
+            words = f"{frame.filename}, line {frame.lineno}, `{frame.line}`"
+            break
+    return (
+        f"{words}: a tensor holds a value for each driver, so that it has no single truth and is no"
+        " single number; write torch.where(condition, this, that) in place of if, and"
+        " torch.maximum, torch.minimum and torch.sqrt in place of max, min and math.sqrt"
+    )
 
 
 def listed(values: Iterable[object], limit: int = 12) -> str:

@@ -35,6 +35,7 @@ from .data.base import (
     FileDatasetSettings as FileDatasetSettings,
     joined as joined,
 )
+from .data.cells import NameColumn as NameColumn
 from .data.files import (
     FileStart as FileStart,
     Floats as Floats,
@@ -43,6 +44,7 @@ from .data.files import (
     first_bytes as first_bytes,
     open_text as open_text,
     stem as stem,
+    unpacking as unpacking,
 )
 from .data.pairs import Dropped as Dropped, Pair as Pair, PairBatch as PairBatch, PairSet as PairSet
 from .data.pairs import Remark as Remark
@@ -55,7 +57,6 @@ from .data.style import (
 from .data.table import (
     FileColumn as FileColumn,
     Layout as Layout,
-    NameColumn as NameColumn,
     Table as Table,
     read_table as read_table,
 )

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import logging
+import math
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
+import torch
 
 from cfx.core.console import ConsoleHandler
-from cfx.errors import DataError, printable, without_passwords
+from cfx.errors import DataError, in_words, printable, without_passwords
 
 
 def test_names_cannot_command_a_terminal() -> None:
@@ -36,3 +40,16 @@ def test_messages_of_the_log_are_as_harmless(capsys: pytest.CaptureFixture[str])
     )
     ConsoleHandler().emit(record)
     assert capsys.readouterr().out == "pair \\x1b[2J of postgresql://a:***@c/d\n"
+
+
+@pytest.mark.parametrize(
+    "asked", [lambda values: max(values, 0.0), float, math.sqrt, lambda values: values and 1]
+)
+def test_python_that_asks_a_tensor_for_one_value_is_told_what_to_write(
+    asked: Callable[[torch.Tensor], object],
+) -> None:
+    with pytest.raises((RuntimeError, ValueError)) as error:
+        asked(torch.ones(2))
+    words = in_words(error.value)
+    assert "torch.where(condition, this, that)" in words
+    assert f"{Path(__file__).name}, line " in words

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 import pandas as pd
-import pyarrow as pa
 
 from cfx.app.overrides import IN_MEMORY, config_of
 from cfx.core import registry
@@ -19,6 +18,7 @@ from cfx.core.files import absolute
 from cfx.core.storage import is_url
 from cfx.data.base import Dataset
 from cfx.data.describe import dataset_of
+from cfx.data.frames import Frame, frame_of_source
 from cfx.data.names import named_twice, names_of
 from cfx.data.pairs import PairSet
 from cfx.data.tidy import TidyDataset, TidySettings, frame_of, pairs_from_frame, write_tidy
@@ -64,7 +64,7 @@ class FrameDataset(TidyDataset):
         frame: a row per pair and frame.
     """
 
-    def __init__(self, settings: TidySettings, frame: pd.DataFrame) -> None:
+    def __init__(self, settings: TidySettings, frame: Frame) -> None:
         super().__init__(settings)
         self._frame = frame
 
@@ -198,9 +198,9 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
     """Reads leader-follower pairs, as `data=DATASET data.path=SOURCE` on the command line.
 
     Args:
-        source: the path or URL of a recording, a pattern, a list of them; or a data frame in the
-            tidy layout (pandas, xarray, or whatever has an Arrow interface, such as polars). None
-            for a dataset that reads no file.
+        source: the path or URL of a recording, a pattern, a list of them; or a table in the tidy
+            layout: a data frame of any library (pandas, polars, pyarrow, xarray, DuckDB, Dask), a
+            mapping of columns, a list of rows or of tables. None for a dataset that reads no file.
         dataset: the dataset that reads it, as after `data=`; None: found from the file itself.
         settings: of the dataset: `min_duration=30`, `time_step=0.1`, `max_pairs=20` and so on; a
             table's own names and units: `columns={"speed": "v"}`, `units={"speed": "km/h"}`.
@@ -224,7 +224,8 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
         if dataset is None:
             raise ConfigError("give a file or a data frame, or dataset=NAME")
         return Pairs.of(config_of({"data": dataset, **given}).data)
-    frame = _data_frame(source)
+    source = _all_of(source)
+    frame = frame_of_source(source)
     if frame is not None:
         given["data.path"] = IN_MEMORY
         node = config_of({"data": dataset or "tidy", **given}).data
@@ -239,13 +240,20 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
     return Pairs.of(config_of({"data": name, **given}).data)
 
 
+def _all_of(source: Any) -> Any:
+    """Returns a list in place of a generator, whose elements can be had only once."""
+    if isinstance(source, Iterator) and not hasattr(source, "read"):
+        return list(source)
+    return source
+
+
 def _paths(source: Any) -> list[str | Path]:
     """Returns the paths of several recordings.
 
     Raises:
         ConfigError: it is no list of paths.
     """
-    found = list(source) if isinstance(source, Iterable) else []
+    found = list(source) if isinstance(source, list | tuple | set) else []
     if not found or not all(isinstance(one, str | Path) for one in found):
         raise ConfigError(
             f"a {type(source).__name__} of this kind is no recording; give a path, a list of paths,"
@@ -261,16 +269,3 @@ def pairs_from(given: PairsLike) -> Pairs:
     if isinstance(given, PairSet):
         return Pairs(given, {"name": "tidy", "path": IN_MEMORY})
     return read(given)
-
-
-def _data_frame(source: Any) -> pd.DataFrame | None:
-    """Returns a table as a pandas data frame; None for what is no table."""
-    if isinstance(source, pd.DataFrame):
-        return source
-    if hasattr(source, "__arrow_c_stream__"):  # polars, pyarrow, DuckDB and others
-        frame: pd.DataFrame = pa.table(source).to_pandas()
-        return frame
-    if hasattr(source, "to_dataframe"):  # xarray
-        # On a grid of pairs and frames, cells beyond the end of a pair are empty.
-        return cast(pd.DataFrame, source.to_dataframe().dropna(how="all").reset_index())
-    return None

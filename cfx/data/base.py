@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import math
 import re
@@ -189,6 +190,7 @@ class Contents(NamedTuple):
         vehicles: how many there are, over all recordings.
         problem: a sentence on what a user should know before they use it; "" if there is none.
         has_gaps: the file gives gaps, which do not depend on vehicles' lengths.
+        unnamed: what has no ids in the file, in words that follow "vehicles"; "" if all have.
     """
 
     pairs: PairSet
@@ -196,6 +198,7 @@ class Contents(NamedTuple):
     vehicles: int
     problem: str = ""
     has_gaps: bool = False
+    unnamed: str = ""
 
 
 class Dataset(Component):
@@ -422,6 +425,14 @@ _NOUNS = {
 """What the settings that select pairs by a value name."""
 
 
+_UNLABELLED = {
+    "lanes": "in which lane they are",
+    "driver_type": "what drives the follower",
+    "leader_driver_type": "what drives the leader",
+}
+"""What some pairs do not say, by the setting that selects by it."""
+
+
 def _selected(pairs: PairSet, name: str, setting: Any) -> PairSet:
     """Keeps the pairs that a setting names, one value or a list of them; all where it is None."""
     if setting is None:
@@ -433,9 +444,7 @@ def _selected(pairs: PairSet, name: str, setting: Any) -> PairSet:
         if blank in recorded:
             recorded.remove(blank)
     if not recorded:
-        unsaid = "what drives its vehicles"
-        if name == "lanes":
-            unsaid = "in which lane its pairs are"
+        unsaid = _UNLABELLED.get(name, "what its pairs are called")
         raise DataError(
             f"data.{name}={setting}: {pairs.source} does not say {unsaid}; leave data.{name} out"
         )
@@ -458,6 +467,21 @@ def _selected(pairs: PairSet, name: str, setting: Any) -> PairSet:
         raise DataError(
             f"data.{name}={setting}: {pairs.source}: {mistake} Known: {listed(recorded)}."
         )
+    if name in _UNLABELLED:
+        is_labelled = [value not in {None, ""} for value in values]
+        unlabelled = len(values) - sum(is_labelled)
+        if unlabelled:
+            log.warning(
+                "%s: of %d of %d pairs it is not said %s; they are left out (data.%s=%s)",
+                pairs.source,
+                unlabelled,
+                len(values),
+                _UNLABELLED[name],
+                name,
+                setting,
+            )
+        pairs = pairs.select(is_labelled, f"of which it is not said {_UNLABELLED[name]}")
+        values = list(itertools.compress(values, is_labelled))
     return pairs.select([value in chosen for value in values], others)
 
 

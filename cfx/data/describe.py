@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import logging
+import re
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -113,9 +114,14 @@ def describe(
         return Description(_describe_partitions(path, reader), None)
     dataset = reader.of(path)
     contents = dataset.contents()
-    pieces: list[RenderableType] = [str(path), "", _overview(dataset.layout, contents)]
+    pieces: list[RenderableType] = [
+        str(path),
+        "",
+        _overview(dataset.layout, contents, dataset.units()),
+    ]
     if len(contents.pairs):
         pieces += ["", _motion(contents.pairs)]
+        pieces += _without_length(contents.pairs)
     left_out = _counts(contents.pairs.dropped)
     heading = "Left out in reading:"
     if not left_out:
@@ -166,9 +172,13 @@ def _site_cells(pairs: Sequence[Pair]) -> Iterator[str]:
     yield f"{len(driver_names(pairs)):,}"
     yield f"{seconds / 60:,.0f}"
     speed = over_frames(pairs, "follower_speed")
-    headway = over_frames(pairs, "leader_position") - over_frames(pairs, "follower_position")
-    moving = speed >= STANDING_MPS
-    for values in (speed, headway[moving] / speed[moving], over_frames(pairs, "gap")):
+    known = _with_length(pairs)
+    headway, at_speed = np.zeros(0), np.zeros(0)
+    if known:
+        headway = over_frames(known, "leader_position") - over_frames(known, "follower_position")
+        at_speed = over_frames(known, "follower_speed")
+    moving = at_speed >= STANDING_MPS
+    for values in (speed, headway[moving] / at_speed[moving], over_frames(pairs, "gap")):
         if not len(values):
             yield "-"
             continue
@@ -330,15 +340,78 @@ def dataset_of(path: Path) -> str:
             return entry.name
         if cls.layout:
             layouts.append(f"{cls.layout} (data={entry.name})")
+    if start.magic and not start.lines and not start.columns:
+        raise DataError(
+            f"{path}: is a binary file that no dataset knows. Known layouts: {'; '.join(layouts)}."
+            " Write a table as CSV or parquet (docs/how-to/own-recording.md)"
+        )
+    if start.lines and start.lines[0].lstrip().startswith("<"):
+        raise DataError(
+            f"{path}: is XML, of which SUMO's FCD output alone is read (<fcd-export>); write a"
+            " table as CSV or parquet (docs/how-to/own-recording.md)"
+        )
     has_names = has_letters("".join(start.columns))
     if start.path.is_dir() or has_names:
         columns = listed(start.columns, 20) or "none: it is a folder"
         raise DataError(
             f"{path}: no dataset knows this layout. Columns found: {columns}. Known layouts:"
-            f" {'; '.join(layouts)}. Name the columns of a table of pairs (data.columns, see"
-            " docs/how-to/own-recording.md), or see docs/readers.md"
+            f" {'; '.join(layouts)}. {_own_columns(path, start.columns)}"
         )
     return "ngsim"  # whose reader says what is wrong with a file without column names
+
+
+_AHEAD = "lead|ahead|front|prec|target|other"
+_QUANTITIES = {
+    "pair_id": "^(pair|trip|ride|run|event|session|id|drive)[ _-]?(id|no|number)?$",
+    "time": "^(t|time|timestamp|seconds|sec|zeit)([ _(]|$)",
+    "leader_speed": rf"({_AHEAD}).*(speed|vel|kmh|km/h|mph|mps)|(speed|vel|^v).*({_AHEAD})|^vl$",
+    "speed": "speed|vel|^v([ _(]|$)|kmh|km/h|mph|mps",
+    "gap": "gap|dist|spacing|range|clearance|abstand",
+}
+"""What a table of pairs has at least, and what its columns are called elsewhere."""
+
+_WRITTEN_UNITS = {
+    "km/h": "km/?h|kph",
+    "mph": "mph",
+    "ft/s": "ft/s|fps|ft_s",
+    "ms": "(^|[ _(])(ms|millis)",
+    "us": "(^|[ _(])(us|micros)",
+    "ns": "(^|[ _(])(ns|nanos)",
+    "ft": "(^|[ _(])(ft|feet)([ _)]|$)",
+}
+"""Units that names of columns end in."""
+
+
+def _own_columns(path: Path, columns: Sequence[str]) -> str:
+    """Returns what to write for a table whose columns have names of their own."""
+    taken: dict[str, str] = {}
+    units = []
+    for quantity, expression in _QUANTITIES.items():
+        for name in columns:
+            if name not in taken.values() and re.search(expression, name.lower()):
+                taken[quantity] = name
+                break
+        unit = _unit_in(taken.get(quantity, ""), quantity)
+        if unit:
+            units.append((quantity, unit))
+    words = []
+    for quantity in _QUANTITIES:
+        words.append(f"data.columns.{quantity}={shlex.quote(taken.get(quantity, 'COLUMN'))}")
+    words += [f"data.units.{quantity}={unit}" for quantity, unit in units]
+    return (
+        "If it is a table of pairs, a row for each pair and frame, say what its columns are, and"
+        f" their units: cfx data describe {shlex.quote(str(path))} {' '.join(words)}"
+        " (docs/how-to/own-recording.md); else see docs/readers.md"
+    )
+
+
+def _unit_in(name: str, quantity: str) -> str:
+    """Returns the unit that a column's name says it has; "" if none."""
+    fits = {"time": ("ms", "us", "ns"), "gap": ("ft",)}.get(quantity, ("km/h", "mph", "ft/s"))
+    for unit in fits:
+        if quantity != "pair_id" and re.search(_WRITTEN_UNITS[unit], name.lower()):
+            return unit
+    return ""
 
 
 def _usable(entry: Entry) -> type[Dataset] | None:
@@ -390,7 +463,23 @@ def _advice(pairs: Sequence[tuple[int, float]], usual: float) -> tuple[str, list
     ]
 
 
-def _overview(layout: str, contents: Contents) -> Table:
+def _without_length(pairs: PairSet) -> list[str]:
+    """Returns what follows from leaders whose length is not known."""
+    unknown = len(pairs) - len(_with_length(pairs))
+    if not unknown:
+        return []
+    return [
+        f"The length of {unknown:,} of {len(pairs):,} leaders is not known: their positions are of"
+        " rear bumpers, and from front to front they are farther than the gap by their length"
+    ]
+
+
+def _with_length(pairs: Sequence[Pair]) -> list[Pair]:
+    """Returns the pairs the length of whose leader is known."""
+    return [pair for pair in pairs if pair.leader_length > 0]
+
+
+def _overview(layout: str, contents: Contents, units: Mapping[str, str]) -> Table:
     """Returns what a file holds, a row per question."""
     pairs = contents.pairs
     recordings: Counter[str] = Counter()
@@ -408,7 +497,10 @@ def _overview(layout: str, contents: Contents) -> Table:
     table = Table.grid(padding=(0, 3))
     table.add_row("layout", layout)
     table.add_row("rows", f"{contents.rows:,}")
-    table.add_row("vehicles", f"{contents.vehicles:,}")
+    table.add_row("vehicles", _vehicles(contents))
+    if units:
+        read_in = [f"{name.replace('_', ' ')} in {unit}" for name, unit in units.items()]
+        table.add_row("units", f"as read: {listed(read_in, 10)}; converted to SI units")
     with_pairs = "none with pairs"
     if recordings:
         with_pairs = f"{len(recordings)}: {listed(_with_counts(recordings), 6)}"
@@ -431,6 +523,15 @@ def _overview(layout: str, contents: Contents) -> Table:
     if truth:
         table.add_row("true parameters", f"known, of {listed(sorted(truth))}")
     return table
+
+
+def _vehicles(contents: Contents) -> str:
+    """Returns how many vehicles a file names, and which it does not."""
+    if not contents.unnamed:
+        return f"{contents.vehicles:,}"
+    if not contents.vehicles:
+        return f"not known: {contents.unnamed}"
+    return f"{contents.vehicles:,}; {contents.unnamed}"
 
 
 def _with_counts(pairs: Mapping[str, int]) -> list[str]:
@@ -457,16 +558,22 @@ def _quantities(pairs: PairSet) -> Iterator[tuple[str, Floats]]:
     """Yields what the table of motion is about: a name with its unit, and the values."""
     speed = over_frames(pairs, "follower_speed")
     gap = over_frames(pairs, "gap")
-    headway = over_frames(pairs, "leader_position") - over_frames(pairs, "follower_position")
-    moving = speed >= STANDING_MPS
     yield "frames", np.array(frames_of_each(pairs), dtype=np.float64)
     yield "leader speed, m/s", over_frames(pairs, "leader_speed")
     yield "follower speed, m/s", speed
     yield "follower acceleration, m/s2", over_frames(pairs, "follower_acceleration")
     yield "gap (bumper to bumper), m", gap
+    known = _with_length(pairs)
+    if not known:
+        moving = speed >= STANDING_MPS
+        yield f"time gap (above {STANDING_MPS:g} m/s), s", gap[moving] / speed[moving]
+        return
+    speed = over_frames(known, "follower_speed")
+    headway = over_frames(known, "leader_position") - over_frames(known, "follower_position")
+    moving = speed >= STANDING_MPS
     yield "space headway (front to front), m", headway
     yield f"time headway (above {STANDING_MPS:g} m/s), s", headway[moving] / speed[moving]
-    yield "leader length, m", np.array(of_each(pairs, "leader_length"))
+    yield "leader length, m", np.array(of_each(known, "leader_length"))
 
 
 def _counts(counts: Sequence[Dropped]) -> list[str]:

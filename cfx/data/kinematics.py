@@ -34,7 +34,7 @@ import numpy as np
 
 from cfx.data.files import Floats
 from cfx.data.pairs import Pair, PairSet
-from cfx.data.tracks import beyond_rates, distance_driven
+from cfx.data.tracks import beyond_rates, follows_from_gaps
 from cfx.data.units import factor
 
 _WINDOW_S = 5.0
@@ -135,7 +135,7 @@ _LIKELY = {
     "position": ("m", "ft", "cm", "mm", "km"),
     "gap": ("m", "ft", "cm"),
     "speed": ("m/s", "km/h", "ft/s", "mph", "kn", "cm/s"),
-    "time": ("s", "ms"),
+    "time": ("s", "ms", "us", "ns"),
     "acceleration": ("m/s2", "g_0", "ft/s2", "km/h/s"),
 }
 """Units in which recordings have a quantity; more would be taken for one another."""
@@ -497,7 +497,7 @@ def _constant(relation: _Relation) -> Contradiction | None:
 def _by_gap(problem: Contradiction, pair: Pair, units: Units) -> Contradiction:
     """Returns a contradiction in the words of a file that has gaps in place of positions."""
     read_in = _units_of("follower", units)
-    if problem.quantity == "speed" or not _has_gaps_alone(pair):
+    if problem.quantity == "speed" or not follows_from_gaps(pair):
         return problem
     gap, leader, follower = pair.gap, pair.leader_speed, pair.follower_speed
     swapped = "the leader's and the follower's speeds look swapped, or the gap's sign turned"
@@ -536,12 +536,6 @@ def _by_gap(problem: Contradiction, pair: Pair, units: Units) -> Contradiction:
         if after.left < least and not rule.breaks_slope(after):
             best, least = words, after.left
     return replace(problem, signals="gap and speeds", quantity="gap", slope=slope, words=best)
-
-
-def _has_gaps_alone(pair: Pair) -> bool:
-    """Says whether positions follow from gaps and speeds, as where a file has none."""
-    left = pair.leader_position - pair.leader_length - distance_driven(pair.leader_speed, pair.dt)
-    return bool(np.abs(left).max() < 1e-6)
 
 
 def _units_of(who: str, units: Units) -> dict[str, str]:

@@ -1,8 +1,8 @@
 """What the name of a pair, a vehicle or a recording is, however a table or a setting writes it.
 
 Tables write names as numbers or as text. pandas turns whole numbers into 10.0 where a join leaves
-one missing, and text files leave blanks beside them. So 10, 10.0, "10", "10.0" and " 10" are one
-name. 007 is another: who writes zeros in front means them.
+one missing, and text files leave blanks beside them. So 10, 10.0, "10", "10.0", "10,0" and " 10"
+are one name. 007 is another: who writes zeros in front means them.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ __all__ = [
 """What plugins may use, as `cfx.plugin.names`."""
 
 
-_WHOLE_NUMBER = re.compile(r"-?\d+\.0*")
-"""A whole number that is written with a decimal point."""
+_WHOLE_NUMBER = re.compile(r"-?\d+(?:\.0*|,(?:0|00|0{4,}))")
+"""A whole number that is written with a decimal mark; in 1,000 the comma marks thousands."""
 
 _MISSING = {"NoneType", "NAType", "NaTType"}
 """Types of what stands in a cell without a name; pandas is not imported for two of them."""
@@ -42,7 +42,7 @@ def name_of(value: object) -> str:
         return ""
     text = str(value).strip()
     if _WHOLE_NUMBER.fullmatch(text):
-        return text.partition(".")[0]
+        return re.split("[.,]", text)[0]
     return text
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cfx.data.pairs import Pair, PairSet, of_each, twins
 from cfx.data.style import STANDING_MPS
-from cfx.data.tracks import beyond_rates
+from cfx.data.tracks import beyond_rates, follows_from_gaps
 
 Marks = NDArray[np.bool_]
 
@@ -80,8 +80,26 @@ def doubts(pairs: PairSet) -> Iterator[str]:
 
 def rare(pairs: PairSet) -> Iterator[str]:
     """Yields a sentence for each kind of frames that recordings have, but few."""
-    for what, wrong in _RARE.items():
-        yield from _counted(pairs, what, wrong)
+    for what, (wrong, advice) in _RARE.items():
+        for counted in _counted(pairs, what, wrong):
+            yield f"{counted}: {advice}"
+    backwards = list(_counted(pairs, "steps in which a vehicle moves backwards", _goes_back))
+    for counted in backwards:
+        if all(follows_from_gaps(pair) for pair in pairs if _goes_back(pair).any()):
+            yield (
+                f"{counted}: positions follow from the leader's speed and the gap here, so this is"
+                " the noise of the gap while vehicles stand or creep, and no contradiction; use it"
+                " as it is"
+            )
+        else:
+            yield (
+                f"{counted}: noise of the positions while vehicles stand or creep; if it is more"
+                " than that, leave out these pairs"
+            )
+
+
+def _goes_back(pair: Pair) -> Marks:
+    return np.diff(pair.follower_position) < 0
 
 
 def _jumps(pair: Pair) -> Marks:
@@ -121,17 +139,21 @@ _DOUBTFUL: Mapping[str, Callable[[Pair], Marks]] = {
         _is_frozen
     ),
 }
-_RARE: Mapping[str, Callable[[Pair], Marks]] = {
-    "frames with a gap below 0.5 m": lambda pair: pair.gap < 0.5,
-    "frames with a speed above 50 m/s": lambda pair: (
-        np.maximum(pair.leader_speed, pair.follower_speed) > 50
+_RARE: Mapping[str, tuple[Callable[[Pair], Marks], str]] = {
+    "frames with a gap below 0.5 m": (
+        lambda pair: pair.gap < 0.5,
+        "are lengths and positions right?",
     ),
-    "frames with an acceleration or braking above 8 m/s2": lambda pair: (
-        np.abs(pair.follower_acceleration) > 8
+    "frames with a speed above 50 m/s": (
+        lambda pair: np.maximum(pair.leader_speed, pair.follower_speed) > 50,
+        "are speeds in m/s?",
     ),
-    "steps in which a vehicle moves backwards": lambda pair: np.diff(pair.follower_position) < 0,
+    "frames with an acceleration or braking above 8 m/s2": (
+        lambda pair: np.abs(pair.follower_acceleration) > 8,
+        "noise of differences of speeds, or a wrong unit",
+    ),
 }
-"""What is counted, and which frames or steps of a pair count."""
+"""What is counted, which frames of a pair count, and what to ask of them."""
 
 
 def _counted(pairs: PairSet, what: str, wrong: Callable[[Pair], Marks]) -> Iterator[str]:

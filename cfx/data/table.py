@@ -10,33 +10,45 @@ Rows are numbered as an editor shows them: the header is row 1 (blank lines are 
 
 from __future__ import annotations
 
-import csv
 import io
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
-import pandas as pd
 import pyarrow as pa
-import pyarrow.compute as pc
 import pyarrow.csv
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from cfx.data.cells import (
+    NameColumn,
+    Unreadable,
+    Written,
+    in_column,
+    names_in,
+    numbers_or_text,
+    parsed,
+)
 from cfx.data.files import (
     PARQUET,
     Floats,
     Ints,
+    cells_of,
+    decoded,
     first_bytes,
+    first_line_of,
     has_letters,
     open_text,
+    parquet_source,
     read_head,
+    separator_of,
     unpacking,
+    without_mark,
 )
-from cfx.data.names import name_of, names_of
+from cfx.data.frames import frame_of_any
 from cfx.errors import DataError, first_line, listed, nearest
 
 if TYPE_CHECKING:
@@ -44,14 +56,6 @@ if TYPE_CHECKING:
 
 _BLOCK = 1 << 22
 """Bytes that are parsed at once."""
-
-_UTF16 = (b"\xff\xfe", b"\xfe\xff")
-_OTHER_SEPARATORS = {";": "semicolons", "\t": "tabs", "|": "vertical bars"}
-_ABSENT = ("", "nan", "na", "null", "none", "n/a", "#n/a")
-"""Cells that stand for no number, in small letters."""
-
-_CONTROL = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
-"""Bytes below 32 that no text has: all but tab, line feed, form feed and carriage return."""
 
 _PANDAS_INDEX = "__index_level_0__"
 """A column that pandas adds to parquet files for the rows' index; it is not the user's."""
@@ -120,8 +124,8 @@ class Layout:
         remedy: what to do about an empty cell.
         headerless: names of the columns of a text without a header, by their number.
         above: lines of a text above its header that are no part of the table.
-        spaces: whether white space may separate columns of a text.
-        separators: what else may separate them.
+        spaces: whether white space may separate columns of a text, as commas, semicolons, tabs and
+            vertical bars may.
         parquet: whether it may be stored as parquet too.
         plain: turns a column's name into the form in which names are compared.
     """
@@ -134,12 +138,14 @@ class Layout:
     headerless: Mapping[int, tuple[str, ...]] = field(default_factory=dict)
     above: int = 0
     spaces: bool = False
-    separators: tuple[str, ...] = (",",)
     parquet: bool = False
     plain: Callable[[str], str] = str
 
-    def found_in(self, source: str, names: Sequence[str]) -> dict[str, _Found]:
+    def found_in(self, source: str, names: Sequence[str], advice: str = "") -> dict[str, _Found]:
         """Returns the layout's columns among those of a file, by the names that they keep.
+
+        Args:
+            advice: what to say besides where a column is missing.
 
         Raises:
             DataError: a column is missing or stands twice.
@@ -167,7 +173,7 @@ class Layout:
                     f"{source}: column {name} stands in the file more than once; remove one of them"
                 )
         if missing:
-            raise DataError(self._missing(source, missing, names))
+            raise DataError(self._missing(source, missing, names) + advice)
         return matches
 
     def _matches(
@@ -234,20 +240,6 @@ class _Found(NamedTuple):
     at: int
 
 
-class NameColumn(NamedTuple):
-    """A column of names: `codes` `(N,)` points into `names`; -1 is an empty cell."""
-
-    codes: Ints
-    names: list[str]
-
-    def at(self, row: int) -> str:
-        """Returns the name in a row; "" for an empty cell."""
-        code = int(self.codes[row])
-        if code < 0:
-            return ""
-        return self.names[code]
-
-
 @dataclass(frozen=True)
 class Table:
     """The columns of a file or a data frame, every cell of which fits the layout.
@@ -300,6 +292,13 @@ class Table:
                 return declared.title
         return column
 
+    def unreadable(self, error: Unreadable) -> DataError:
+        """Returns the error of a cell or a column that is not what it should be."""
+        where = self.source
+        if error.row is not None:
+            where += f", row {self.row(error.row)}"
+        return DataError(f"{where}, column {self.title(error.column)}: {error.what}")
+
     def refuse(self, column: str, wrong: NDArray[bool_], why: str) -> None:
         """Raises DataError if any cell of a column of numbers is wrong; names the first.
 
@@ -331,7 +330,8 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
         DataError: the file cannot be read, a column is missing, or a cell is wrong; the message
             names file, row and column.
     """
-    if first_bytes(path) != PARQUET:
+    first_bytes(path)
+    if read_head(path)[:4] != PARQUET:
         return _read_text(path, layout)
     if not layout.parquet:
         raise DataError(
@@ -339,7 +339,7 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
             " Pairs in the tidy layout are read with data=tidy"
         )
     try:
-        file = pq.ParquetFile(path)
+        file = pq.ParquetFile(parquet_source(path))
         stored = file.schema_arrow.names
         more = dict(given or {})
         for name in stored:
@@ -359,31 +359,25 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
     return _checked(_Source(str(path), layout, [*stored, *more], 1), matches, columns)
 
 
-def table_of(frame: pd.DataFrame, layout: Layout, source: str) -> Table:
-    """Returns the columns of a layout from a data frame, every cell checked.
+def table_of(source: Any, layout: Layout, name: str) -> Table:
+    """Returns the columns of a layout from somebody's table, every cell checked.
 
     Args:
-        source: what messages call it; its rows are counted from 1.
+        source: a data frame of any library (`cfx.data.frames`).
+        name: what messages call it; its rows are counted from 1.
 
     Raises:
-        DataError: as `read_table`; or a column mixes numbers and text.
+        DataError: as `read_table`; or it is no table.
     """
-    names = [str(name) for name in frame.columns]
-    matches = layout.found_in(source, names)
-    used = frame.set_axis(names, axis=1)[[names[match.at] for match in matches.values()]]
+    frame = frame_of_any(source, name)
+    matches = layout.found_in(name, frame.names, frame.advice)
+    used = {}
     for match in matches.values():
-        name = names[match.at]
-        # Names may be numbers in some rows and text in others; Arrow wants one type.
-        if match.column.is_name and pd.api.types.infer_dtype(used[name]).startswith("mixed"):
-            used = used.assign(**{name: names_of(used[name])})
-    try:
-        columns = pa.Table.from_pandas(used, preserve_index=False)
-    except pa.ArrowException as error:
-        raise DataError(
-            f"{source}: a column mixes numbers and text ({first_line(error)});"
-            " give each column one type"
-        ) from None
-    return _checked(_Source(source, layout, names, 1), matches, columns)
+        try:
+            used[frame.names[match.at]] = frame.column(match.at)
+        except Unreadable as error:
+            raise DataError(f"{name}, column {match.column.title}: {error.what}") from None
+    return _checked(_Source(name, layout, frame.names, 1), matches, pa.table(used))
 
 
 # --- cells ----------------------------------------------------------------------------------------
@@ -402,14 +396,26 @@ def _checked(source: _Source, matches: Mapping[str, _Found], columns: Any) -> Ta
     """Returns Arrow columns as a table of numbers and names, in the layout's units."""
     ignored = _ignored(source, matches)
     numbers: dict[str, Floats] = {}
+    read: dict[str, Floats | Written] = {}
     labels: dict[str, NameColumn] = {}
     table = Table(source.name, source.layout, numbers, labels, source.first_row, ignored)
     for name, match in matches.items():
         cells = columns.column(source.columns[match.at])
-        if match.column.is_name:
-            labels[name] = _labels(table, name, cells)
-        else:
-            numbers[name] = _floats(table, name, cells)
+        try:
+            with in_column(name):
+                if match.column.is_name:
+                    labels[name] = names_in(cells)
+                else:
+                    _require_unitless(cells, match.column)
+                    # A date has its own unit, so it is none where a setting says another one.
+                    unit = match.column.unit if match.column.factor == 1.0 else ""
+                    read[name] = numbers_or_text(cells, unit, is_whole=match.column.whole)
+        except Unreadable as error:
+            raise table.unreadable(error) from None
+    try:
+        numbers.update(parsed(read))
+    except Unreadable as error:
+        raise table.unreadable(error) from None
     if not len(table):
         raise DataError(f"{source.name}: has the right columns but no rows")
     for name, names in labels.items():
@@ -421,6 +427,14 @@ def _checked(source: _Source, matches: Mapping[str, _Found], columns: Any) -> Ta
         if match.column.factor != 1.0:
             numbers[name] = numbers[name] * match.column.factor
     return table
+
+
+def _require_unitless(cells: Any, column: FileColumn) -> None:
+    """Raises Unreadable for dates, times or durations of which a setting says another unit."""
+    if column.factor != 1.0 and pa.types.is_temporal(cells.type):
+        raise Unreadable(
+            f"holds {cells.type}, which has no other unit; leave its unit out of data.units"
+        )
 
 
 def _ignored(source: _Source, matches: Mapping[str, _Found]) -> list[str]:
@@ -466,90 +480,6 @@ def _require_numbers(table: Table, name: str, values: Floats, column: FileColumn
     table.refuse(name, wrong, column.wrong)
 
 
-_THOUSANDS = r"^[+-]?[1-9][0-9]{0,2}(,[0-9]{3})+(\.[0-9]*)?$"
-
-
-def _floats(table: Table, name: str, column: Any) -> Floats:
-    """Returns an Arrow column as numbers `(N,)`: 1234 for "1,234", NaN for an empty cell."""
-    where = f"column {table.title(name)}"
-    if pa.types.is_dictionary(column.type):
-        column = column.cast(column.type.value_type)
-    if not (pa.types.is_string(column.type) or pa.types.is_large_string(column.type)):
-        try:
-            return cast(Floats, column.cast(pa.float64()).to_numpy())
-        except (pa.ArrowException, ValueError):
-            raise DataError(
-                f"{table.source}, {where}: holds {column.type}, not numbers; write it as numbers"
-            ) from None
-    trimmed = pc.utf8_trim_whitespace(column)
-    grouped = pc.match_substring_regex(trimmed, _THOUSANDS)
-    plain = pc.if_else(grouped, pc.replace_substring(trimmed, ",", ""), trimmed)
-    text = plain.to_pandas()
-    values: Floats = pd.to_numeric(text, errors="coerce").to_numpy(
-        dtype=np.float64, na_value=np.nan
-    )
-    absent = text.isna() | text.str.lower().isin(_ABSENT)
-    wrong = np.flatnonzero(np.isnan(values) & ~absent.to_numpy(dtype=bool))
-    if len(wrong):
-        row = int(wrong[0])
-        written = column[row].as_py()
-        remedy = "correct it"
-        if "," in written:
-            remedy = "write decimals with a point"
-        elif "-" in written[1:] and ":" in written:
-            remedy = "write the seconds since a frame of your choice"
-        raise DataError(
-            f"{table.source}, row {table.row(row)}, {where}: '{written}' is not a number; {remedy}"
-        )
-    return values
-
-
-def _labels(table: Table, name: str, column: Any) -> NameColumn:
-    """Returns an Arrow column as names, in the order in which they first appear."""
-    where = f"column {table.title(name)}"
-    if pa.types.is_nested(column.type):
-        raise DataError(
-            f"{table.source}, {where}: holds {column.type}, not names; write a text or a number in"
-            " each row"
-        )
-    try:
-        column.validate(full=True)
-    except pa.ArrowException:
-        raise DataError(
-            f"{table.source}{_first_broken(column)}, {where}: is no text in UTF-8; write the file"
-            " again in UTF-8"
-        ) from None
-    if not (pa.types.is_dictionary(column.type) or pa.types.is_floating(column.type)):
-        column = column.cast(pa.string())
-    if not pa.types.is_dictionary(column.type):
-        column = pc.dictionary_encode(column)
-    if isinstance(column, pa.ChunkedArray):
-        column = column.unify_dictionaries().combine_chunks()
-    if isinstance(column, pa.ChunkedArray):  # no chunk at all
-        return NameColumn(np.zeros(0, np.int64), [])
-    written: list[str | None] = []
-    for cell in column.dictionary.to_pylist():
-        written.append(name_of(cell) or None)
-    merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
-    codes = pc.fill_null(column.indices, len(written)).to_numpy(zero_copy_only=False)
-    return NameColumn(np.append(merged, -1).astype(np.int64)[codes], list(names))
-
-
-def _first_broken(column: Any) -> str:
-    """Returns ", row N" for the first cell that is no UTF-8; "" where no row is known."""
-    row = 1
-    for chunk in column.chunks:
-        if not (pa.types.is_string(chunk.type) or pa.types.is_large_string(chunk.type)):
-            return ""
-        for cell in chunk.cast(pa.large_binary(), safe=False):
-            try:
-                (cell.as_py() or b"").decode()
-            except UnicodeDecodeError:
-                return f", row {row}"
-            row += 1
-    return ""
-
-
 # --- delimited text -------------------------------------------------------------------------------
 
 
@@ -582,36 +512,21 @@ def _read_text(path: Path, layout: Layout) -> Table:
 def _read_header(path: Path, layout: Layout) -> _Text:
     """Reads the header and the separator of a text file."""
     head = read_head(path)
-    if head.startswith(_UTF16):
-        raise DataError(f"{path}: is in UTF-16; save it as UTF-8")
-    lines = _decoded(path, head).splitlines()[layout.above :]
-    first = ""
-    for line in lines:
-        if line.strip():
-            first = line
-            break
-    if not first:
+    lines = decoded(path, head).splitlines()
+    above = first_line_of(lines) + layout.above
+    while above < len(lines) and not lines[above].strip():
+        above += 1
+    if above >= len(lines):
         raise DataError(f"{path}: the file holds no rows")
-    exponents_removed = first.lower().replace("e+", "").replace("e-", "")
-    has_header = has_letters(exponents_removed)
-    delimiter = " "
-    cells = first.split()
-    for separator in layout.separators:
-        if separator in first:
-            delimiter = separator
-            cells = [cell.strip() for cell in next(csv.reader([first], delimiter=separator))]
-            break
-    if delimiter == " ":
-        for separator, plural in _OTHER_SEPARATORS.items():
-            if separator in first and not (separator == "\t" and not has_header):
-                raise DataError(
-                    f"{path}: the columns are separated by {plural}; write the file with commas"
-                )
+    first = without_mark(lines[above])
+    has_header = has_letters(first.lower().replace("e+", "").replace("e-", ""))
+    delimiter = separator_of(first, spaces=layout.spaces)
+    cells = cells_of(first, delimiter)
     if not has_header:
-        return _Text(path, delimiter, _names_without_header(path, layout, len(cells)), layout.above)
+        return _Text(path, delimiter, _names_without_header(path, layout, len(cells)), above)
     if delimiter == " " and len(cells) > 1 and not layout.spaces:
         raise DataError(f"{path}: the columns are separated by spaces; write the file with commas")
-    return _Text(path, delimiter, tuple(cells), layout.above + 1)
+    return _Text(path, delimiter, tuple(cells), above + 1)
 
 
 def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, ...]:
@@ -633,24 +548,6 @@ def _names_without_header(path: Path, layout: Layout, width: int) -> tuple[str, 
     )
 
 
-def _decoded(path: Path, head: bytes) -> str:
-    """Returns the beginning of a file as text; raises DataError if it is none."""
-    is_binary = _CONTROL.search(head) is not None
-    try:
-        text = head.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        # A character that the end of the block cuts in two is none of the file's faults.
-        if error.start < len(head) - 4 and not is_binary:
-            raise DataError(f"{path}: is no text in UTF-8; write the file again in UTF-8") from None
-        text = head.decode("utf-8-sig", errors="ignore")
-    if is_binary:
-        raise DataError(
-            f"{path}: is a binary file, not text; give a CSV or text file (gzip is fine),"
-            " or parquet for data=tidy"
-        )
-    return text
-
-
 def _parsed(text: _Text, matches: Mapping[str, _Found], number_type: Any, spare: int = 0) -> Any:
     """Returns the columns found as one Arrow table.
 
@@ -669,7 +566,7 @@ def _parsed(text: _Text, matches: Mapping[str, _Found], number_type: Any, spare:
 
     parsed_by = text.delimiter
     if text.delimiter == " ":
-        parsed_by = ","  # `_Commas` puts them in place of white space
+        parsed_by = "\t"  # `_Tabs` puts them in place of white space
     types = {}
     for match in matches.values():
         types[f"c{match.at}"] = number_type
@@ -694,7 +591,7 @@ def _parsed(text: _Text, matches: Mapping[str, _Found], number_type: Any, spare:
         with open_text(text.path) as file, unpacking(text.path):
             source: Any = file
             if text.delimiter == " ":
-                source = _Commas(file)
+                source = _Tabs(file)
             # Not open_csv: after an error its threads may wait for one another when Python exits.
             table = pa.csv.read_csv(source, **options)
     except pa.ArrowInvalid as error:
@@ -721,8 +618,8 @@ def _parsed(text: _Text, matches: Mapping[str, _Found], number_type: Any, spare:
     return table.select(list(kept)).rename_columns(list(kept.values()))
 
 
-class _Commas(io.RawIOBase):
-    """A text with commas in place of the white space that separates its cells."""
+class _Tabs(io.RawIOBase):
+    """A text with tabs in place of the white space that separates its cells."""
 
     def __init__(self, file: BinaryIO) -> None:
         super().__init__()
@@ -735,7 +632,7 @@ class _Commas(io.RawIOBase):
     def readinto(self, buffer: Any) -> int:
         if not self._ready:
             lines = b"".join(self._file.readlines(_BLOCK)).splitlines()
-            self._ready = b"".join([b",".join(line.split()) + b"\n" for line in lines])
+            self._ready = b"".join([b"\t".join(line.split()) + b"\n" for line in lines])
         size = min(len(buffer), len(self._ready))
         buffer[:size] = self._ready[:size]
         self._ready = self._ready[size:]

@@ -334,7 +334,31 @@ class TidyDataset(Dataset):
         has_gaps = True
         for file in self._files():
             has_gaps &= gap in beginning(file).columns
-        return super().contents()._replace(has_gaps=has_gaps)
+        contents = super().contents()._replace(has_gaps=has_gaps)
+        unnamed = self._unnamed()
+        if not unnamed:
+            return contents
+        vehicles = set()
+        for pair in contents.pairs:
+            if "leaders" not in unnamed:
+                vehicles.add((pair.recording, pair.leader_id))
+            if "followers" not in unnamed:
+                vehicles.add((pair.recording, pair.follower_id))
+        words = f"{' and '.join(unnamed)} have no ids"
+        return contents._replace(vehicles=len(vehicles), unnamed=words)
+
+    def _unnamed(self) -> list[str]:
+        """Returns who has no ids in some file: leaders, followers, both or neither."""
+        columns = self.settings.columns
+        ids = {
+            "leaders": columns.leader_id or "leader_id",
+            "followers": columns.follower_id or "follower_id",
+        }
+        unnamed = []
+        for who, name in ids.items():
+            if any(name not in beginning(file).columns for file in self._files()):
+                unnamed.append(who)
+        return unnamed
 
     def _files(self) -> list[Path]:
         """Returns the files that are read: of a folder, those of the recording that is chosen."""
@@ -375,7 +399,7 @@ def read_tidy(path: Path, layout: Layout = LAYOUT, signals: Sequence[Signal] = (
 
 
 def pairs_from_frame(
-    frame: pd.DataFrame,
+    frame: Any,
     source: str = "table",
     layout: Layout = LAYOUT,
     signals: Sequence[Signal] = (),
@@ -383,6 +407,7 @@ def pairs_from_frame(
     """Takes pairs from a table in the tidy layout.
 
     Args:
+        frame: a data frame of any library (`cfx.data.frames`).
         source: what messages call the table; its rows are counted from 1.
         layout: the tidy layout, perhaps with the table's own names and units.
         signals: further ones that are taken too.
@@ -410,7 +435,7 @@ def _with_signals(layout: Layout, signals: Sequence[Signal]) -> Layout:
     return replace(layout, columns=tuple(columns))
 
 
-def row_order(frame: pd.DataFrame) -> Ints:
+def row_order(frame: Any) -> Ints:
     """Returns a table's rows `(N,)` in the order in which `pairs_from_frame` takes them.
 
     That is pair by pair, as they first appear, and by time within each.

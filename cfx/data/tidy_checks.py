@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cfx.data.cells import NameColumn
 from cfx.data.files import Floats, Ints
 from cfx.data.kinematics import contradiction
 from cfx.data.pairs import Pair
-from cfx.data.table import NameColumn, Table
+from cfx.data.table import Table
 from cfx.data.tracks import accelerations, distance_driven
 from cfx.errors import DataError
 
@@ -43,7 +44,7 @@ def check(table: Table) -> tuple[Table, Ints, Ints]:
     Raises:
         DataError: names file, row and column.
     """
-    table = _with_names_and_frames(table)
+    table = _with_frames_by_1(_with_names_and_frames(table))
     order, starts = _check_frames(table)
     _check_pairs(table, order, starts)
     if GAP in table.numbers:
@@ -79,6 +80,17 @@ def _with_names_and_frames(table: Table) -> Table:
         within = np.arange(len(table)) - np.repeat(starts, sizes)
         numbers["frame"][order] = np.repeat(first, sizes) + within
     return replace(table, labels=labels, numbers=numbers)
+
+
+def _with_frames_by_1(table: Table) -> Table:
+    """Returns a table whose frames follow by 1, where all of them are the same number apart."""
+    frame, pair = table.numbers["frame"], table.labels["pair_id"].codes
+    order = np.lexsort((frame, pair))
+    within = np.diff(pair[order]) == 0
+    steps = np.diff(frame[order])[within]
+    if not len(steps) or steps[0] < 2 or (steps != steps[0]).any():
+        return table
+    return replace(table, numbers={**table.numbers, "frame": np.floor(frame / steps[0])})
 
 
 def _check_frames(table: Table) -> tuple[Ints, Ints]:

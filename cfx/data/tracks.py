@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from cfx.data.files import Floats, Ints
 from cfx.data.pairs import Dropped, Pair, PairSet, Remark
-from cfx.errors import listed
+from cfx.errors import DataError, listed
 
 __all__ = [
     "NOBODY",
@@ -23,6 +23,7 @@ __all__ = [
     "count_reasons",
     "distance_driven",
     "first_that_holds",
+    "frames_apart",
     "next_in_lane",
     "rows_ahead",
     "runs",
@@ -50,6 +51,10 @@ _FASTEST_MPS, _PLACE_M = 70.0, 10.0
 
 _LEAST_ROWS = 10
 """Rows that tell a vehicle from a few wrong rows of another one."""
+
+
+_FEW_STEPS = 0.02
+"""Share of the steps that are few, where rows are missing."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -506,6 +511,32 @@ def unique_name(name: str, seen: dict[str, int]) -> str:
     return name
 
 
+def frames_apart(source: str, recording: Ints, vehicle: Ints, frame: Ints) -> tuple[Ints, int]:
+    """Returns frames that follow one another by 1, `(N,)`, and how far apart they were.
+
+    Who thins a recording to every second frame keeps the frames' numbers. Rows are sorted by
+    recording, vehicle and frame.
+
+    Raises:
+        DataError: the rows of different vehicles are at different frames.
+    """
+    steps = np.diff(frame)[~changes(recording, vehicle)[1:]]
+    if not len(steps):
+        return frame, 1
+    apart = int(np.median(steps))
+    if apart < 2 or np.count_nonzero(steps % apart) > _FEW_STEPS * len(steps):
+        return frame, 1
+    starts, sizes = runs(recording)
+    first = np.repeat(frame[starts], sizes)
+    is_between = (frame - first) % apart != 0
+    if np.count_nonzero(is_between) > _FEW_STEPS * len(frame):
+        raise DataError(
+            f"{source}: each vehicle has a row at every {apart}th frame, but not all at the same"
+            " ones, so that nobody is seen together with their leader; keep the same frames of all"
+        )
+    return frame // apart, apart
+
+
 def distance_driven(speed: Floats, dt: float) -> Floats:
     """Returns the distance driven since the first frame, `(T,)`, m.
 
@@ -514,6 +545,12 @@ def distance_driven(speed: Floats, dt: float) -> Floats:
     moved = np.zeros_like(speed)
     moved[1:] = np.cumsum(speed[1:]) * dt
     return moved
+
+
+def follows_from_gaps(pair: Pair) -> bool:
+    """Says whether positions follow from gaps and speeds, as where a file has none."""
+    left = pair.leader_position - pair.leader_length - distance_driven(pair.leader_speed, pair.dt)
+    return bool(np.abs(left).max() < 1e-6)
 
 
 def accelerations(speed: Floats, dt: float) -> Floats:

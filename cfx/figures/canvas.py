@@ -19,6 +19,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
+from matplotlib.text import Text
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 from numpy.typing import ArrayLike, NDArray
 
@@ -273,9 +274,25 @@ def styled(draw: Callable[P, Figure]) -> Callable[P, Figure]:
     @functools.wraps(draw)
     def drawn(*args: P.args, **kwargs: P.kwargs) -> Figure:
         with figure_style():
-            return draw(*args, **kwargs)
+            return _fitted(draw(*args, **kwargs))
 
     return drawn
+
+
+_PAGE_IN = 250 / 25.4
+"""Inches that a figure may be high on paper: A4 less its margins."""
+
+
+def _fitted(figure: Figure) -> Figure:
+    """Returns a figure whose titles end where it ends, and which fits a page of paper."""
+    for axes in figure.axes:
+        for child in axes.get_children():
+            if isinstance(child, Text) and child not in axes.texts:  # its titles
+                child.set_wrap(True)
+        axes.xaxis.label.set_wrap(True)
+    if _PAPER.get().room < 1:
+        figure.set_figheight(min(figure.get_figheight(), _PAGE_IN))
+    return figure
 
 
 def blank(height: float, width: float = WIDTH) -> Figure:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from cfx.data.describe import describe
 from cfx.data.pairs import PairSet
-from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.data.tidy import TidyDataset, frame_of, write_tidy
 from cfx.errors import DataError
 from cfx.simulation.synthetic import SyntheticDataset
 from tests.checkout import needs
@@ -178,3 +179,49 @@ def test_the_advice_brings_recordings_to_one_step(tmp_path: Path) -> None:
     path = tmp_path / "pairs.parquet"
     assert advice(path, both) == ["data.time_step=0.1", "It keeps all 2 pairs."]
     assert len(TidyDataset(path=path, time_step=0.1).load()) == 2
+
+
+def test_says_what_it_does_not_know(tmp_path: Path) -> None:
+    frame = frame_of(SyntheticDataset(pairs=2, frames=50).load())
+    gap = frame["leader_position_m"] - frame["leader_length_m"] - frame["follower_position_m"]
+    named = ["pair_id", "time_s", "leader_speed_mps", "follower_speed_mps"]
+    frame[named].assign(gap_m=gap).to_csv(tmp_path / "t.csv", index=False)
+    text = describe(tmp_path / "t.csv").text
+    assert "not known: leaders and followers have no ids" in text
+    assert "length of 2 of 2 leaders is not known" in text
+    assert "front to front), m" not in text
+    frame.assign(gap_m=gap).drop(columns="leader_id").to_csv(tmp_path / "t.csv", index=False)
+    assert "2; leaders have no ids" in describe(tmp_path / "t.csv").text
+
+
+def test_says_the_units_that_it_read(tmp_path: Path) -> None:
+    frame = frame_of(SyntheticDataset(pairs=2, frames=50).load())
+    frame = frame.rename(columns={"follower_speed_mps": "v"})
+    frame["v"] *= 3.6
+    frame.to_csv(tmp_path / "t.csv", index=False)
+    settings = {"name": "tidy", "columns": {"speed": "v"}, "units": {"speed": "km/h"}}
+    text = describe(tmp_path / "t.csv", settings).text
+    assert "as read: speed in km/h; converted to SI units" in text
+
+
+def test_says_what_a_noisy_gap_makes_of_positions(tmp_path: Path) -> None:
+    frame = frame_of(SyntheticDataset(pairs=2, frames=200).load())
+    gap = frame["leader_position_m"] - frame["leader_length_m"] - frame["follower_position_m"]
+    noise = np.where(frame["frame"] % 50 == 0, 3.0, 0.0)
+    named = ["pair_id", "time_s", "leader_speed_mps", "follower_speed_mps"]
+    frame[named].assign(gap_m=gap + noise).to_csv(tmp_path / "t.csv", index=False)
+    text = describe(tmp_path / "t.csv").text
+    assert "moves backwards" in text
+    assert "the noise of the gap while vehicles stand or creep" in text
+
+
+def test_a_table_with_names_of_its_own_is_told_the_line_that_reads_it(tmp_path: Path) -> None:
+    path = tmp_path / "dashcam.csv"
+    path.write_text("trip;t;speed_kmh;ahead_kmh;distance\n1,0;0,0;36,0;36,5;12,5\n")
+    with pytest.raises(DataError) as error:
+        describe(path)
+    assert (
+        f"cfx data describe {path} data.columns.pair_id=trip data.columns.time=t"
+        " data.columns.leader_speed=ahead_kmh data.columns.speed=speed_kmh"
+        " data.columns.gap=distance data.units.leader_speed=km/h data.units.speed=km/h"
+    ) in str(error.value)

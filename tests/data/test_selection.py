@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -166,3 +167,21 @@ def test_paths_know_home_and_the_working_directory(
     monkeypatch.chdir(tmp_path)
     assert FileDatasetSettings(path=Path("~/a.csv")).path == tmp_path / "a.csv"
     assert FileDatasetSettings(path=Path("b.csv")).path == tmp_path / "b.csv"
+
+
+def test_pairs_without_a_label_are_counted_apart(caplog: pytest.LogCaptureFixture) -> None:
+    class Labelled(Ready):
+        pairs = PairSet(
+            tuple(
+                replace(pair, driver_type=kind)
+                for pair, kind in zip(PAIRS, ("human", "acc", "", ""), strict=True)
+            ),
+            "made up",
+        )
+
+    kept = Labelled(min_duration=0, driver_type="human").load()
+    assert kept.dropped == (
+        Dropped("of which it is not said what drives the follower", 2),
+        Dropped("another driver_type than 'human'", 1),
+    )
+    assert "of 2 of 4 pairs it is not said what drives the follower" in caplog.text

@@ -24,14 +24,17 @@ class PoliciesCommand(Command):
             epilog="cfx policies make, of the distribution cfx-report, trains them anew.",
         )
         actions = made.add_subparsers(dest="action")
+        actions.add_parser("list", help="all of them, as without an action")
         show = actions.add_parser("show", help="the card of a policy: what it knows, and how well")
-        name = show.add_argument("name", help="such as i80-idm")
+        name = show.add_argument("name", help="such as i80-idm, or cfx://i80-idm")
         complete_with(name, lambda _: ready.names())
         return made
 
     def run(self, options: argparse.Namespace) -> int:
         if options.action == "show":
-            folder = ready.folder_of_ready_made(f"cfx://{options.name}")
+            folder = ready.folder_of_ready_made(
+                ready.SCHEME + options.name.removeprefix(ready.SCHEME)
+            )
             _show((folder / "CARD.md").read_text("utf-8"))
             return 0
         _overview()

@@ -387,7 +387,9 @@ def _two_line_title(axes: Axes, strong: str, fine: str) -> None:
     # Several methods' errors stand beside each other.
     axes.set_title(fine, fontsize=canvas.points(7.6), color=colours.INK)
     if strong:
-        _above(axes, strong, canvas.points(20), fontsize=canvas.points(11), fontweight="bold")
+        # On narrow paper the errors need two lines.
+        above = 20 if canvas.most_across(2) == 2 else 30
+        _above(axes, strong, canvas.points(above), fontsize=canvas.points(11), fontweight="bold")
 
 
 def _above(axes: Axes, text: str, points: float, **font: Any) -> None:
@@ -399,6 +401,8 @@ def _above(axes: Axes, text: str, points: float, **font: Any) -> None:
         xycoords="axes fraction",
         textcoords="offset points",
         color="black",
+        va="bottom",
+        wrap=True,
         **font,
     )
 

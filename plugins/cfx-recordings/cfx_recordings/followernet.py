@@ -7,9 +7,9 @@ behavior modeling, Scientific Data 10, 828; events of HighD, NGSIM, SPMD, Waymo 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import IO, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,8 @@ from cfx_recordings.series import Series, pairs_of
 
 _NPY, _ZIP, _MATLAB, _HDF = b"\x93NUM", b"PK\x03\x04", b"MATL", b"\x89HDF"
 
-_SPACING, _SPEED, _RELATIVE, _LEADER_SPEED = range(4)
+_ROWS = 4
+_SPACING, _SPEED, _RELATIVE, _LEADER_SPEED = range(_ROWS)
 """Rows of an event."""
 
 _UNPICKLE = (
@@ -84,7 +85,7 @@ class FollowernetDataset(Dataset):
 
     @classmethod
     def recognises(cls, start: FileStart) -> bool:
-        return start.magic in {_NPY, _ZIP, _MATLAB}
+        return any(_are_events(shape, is_number) for shape, is_number in _shapes(start))
 
     def read(self) -> PairSet:
         return self.contents().pairs
@@ -102,7 +103,8 @@ class FollowernetDataset(Dataset):
             parts.append(pairs_of(series, str(path)))
         pairs = joined(parts)
         problem = "events carry no drivers' ids: one driver may be learned from and tested"
-        return Contents(pairs, rows, 2 * len(pairs), problem, has_gaps=True)
+        unnamed = "leaders and followers have no ids"
+        return Contents(pairs, rows, 0, problem, has_gaps=True, unnamed=unnamed)
 
     def _series(self, path: Path, number: int, event: Floats) -> Series:
         recording = stem(path)
@@ -123,6 +125,50 @@ class FollowernetDataset(Dataset):
             signals={"leader_speed": event[_LEADER_SPEED], "follower_speed": event[_SPEED]},
             gap=event[_SPACING] - self.settings.vehicle_length,
         )
+
+
+def _are_events(shape: Sequence[int], is_number: bool) -> bool:
+    """Says whether an array may hold events; of Python objects that is not known unopened."""
+    if not is_number:
+        return True
+    return len(shape) in {2, 3} and shape[-2] == _ROWS
+
+
+def _shapes(start: FileStart) -> Iterator[tuple[Sequence[int], bool]]:
+    """Yields the shape of each array of a file, and whether it holds numbers; opens none of them.
+
+    Other programs write such containers too.
+    """
+    if start.magic == _NPY:
+        with start.path.open("rb") as file:
+            yield from _header(file)
+    elif start.magic == _ZIP:
+        with zipfile.ZipFile(start.path) as archive:
+            for name in archive.namelist():
+                if name.endswith(".npy"):
+                    with archive.open(name) as file:
+                        yield from _header(file)
+    elif start.magic == _MATLAB:
+        from scipy.io import whosmat
+
+        try:
+            for _, shape, kind in whosmat(start.path):
+                yield shape, kind not in {"cell", "struct", "object"}
+        except (ValueError, NotImplementedError, TypeError, OSError):
+            return  # it is damaged
+
+
+def _header(file: IO[bytes]) -> Iterator[tuple[Sequence[int], bool]]:
+    """Yields the shape of a NumPy array and whether it holds numbers; nothing if it is none."""
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0
+        if version != (1, 0):
+            read = np.lib.format.read_array_header_2_0
+        shape, _, kind = read(file)
+    except (ValueError, OSError, EOFError, zipfile.BadZipFile, RuntimeError):
+        return
+    yield shape, kind.kind in "fiu"
 
 
 def _events(path: Path) -> Iterator[Floats]:
@@ -151,7 +197,13 @@ def _arrays(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
         elif start == _ZIP:
             with np.load(path, allow_pickle=False) as arrays:
                 for name in arrays.files:
-                    yield name, arrays[name]
+                    array = arrays[name]
+                    if not isinstance(array, np.ndarray):
+                        raise DataError(
+                            f"{path}: is a zip archive of other files ({name}), not of NumPy"
+                            " arrays (.npz); unpack it"
+                        )
+                    yield name, array
         elif start == _MATLAB:
             yield from _matlab(path)
         elif start == _HDF:

@@ -34,6 +34,9 @@ from cfx.plugin import (
     with_sites,
 )
 
+_PACKINGS = ("", ".gz", ".zip", ".zst", ".xz", ".bz2")
+"""Endings of files that are read unpacked."""
+
 _TRACKS, _TRACKS_META, _RECORDING_META = "_tracks.csv", "_tracksMeta.csv", "_recordingMeta.csv"
 
 
@@ -169,7 +172,7 @@ def _tracks(path: Path, about: Table) -> Tracks:
     drives = Tracks(
         source=str(path),
         dt=1.0 / float(about.numbers["frameRate"][0]),
-        recordings=(f"highd-{path.name.removesuffix(_TRACKS)}",),
+        recordings=(f"highd-{path.name.partition(_TRACKS)[0]}",),
         recording=np.zeros(len(order), dtype=np.int64),
         vehicle=table.whole("id")[order],
         frame=table.whole("frame")[order],
@@ -182,6 +185,8 @@ def _tracks(path: Path, about: Table) -> Tracks:
         driver_type=vehicles.kind[row_of][order],
         driver_types=vehicles.kinds,
     )
+    frame, apart = tracks.frames_apart(str(path), drives.recording, drives.vehicle, drives.frame)
+    drives = replace(drives, frame=frame, dt=drives.dt * apart)
     said = {name: numbers[name][order] for name in _TWICE if name in numbers}
     return replace(drives, remarks=statements.remarks_of(_said_twice(drives, said)))
 
@@ -220,15 +225,19 @@ def _beside(path: Path, ending: str) -> Path:
     Raises:
         DataError: the tracks are not named as highD's, or there is no such file.
     """
-    if not path.name.endswith(_TRACKS):
+    number, found, packing = path.name.partition(_TRACKS)
+    if not found or packing not in _PACKINGS:
         raise DataError(
             f"{path}: highD's tracks are named XX{_TRACKS}; give this file, with"
             f" XX{_TRACKS_META} and XX{_RECORDING_META} beside it"
         )
-    other = path.with_name(path.name.removesuffix(_TRACKS) + ending)
-    if not other.is_file():
-        raise DataError(f"{other}: no such file; it must lie beside {path.name}")
-    return other
+    for packing in _PACKINGS:
+        other = path.with_name(number + ending + packing)
+        if other.is_file():
+            return other
+    raise DataError(
+        f"{path.with_name(number + ending)}: no such file; it must lie beside {path.name}"
+    )
 
 
 def _vehicles(path: Path) -> _Vehicles:

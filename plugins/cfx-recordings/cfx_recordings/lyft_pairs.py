@@ -93,9 +93,8 @@ class LyftPairsDataset(Dataset):
         stores = [_read(path, self.settings.automated_length) for path in self.settings.files()]
         pairs = joined([_pairs(store) for store in stores])
         rows = sum(len(store.time) for store in stores)
-        vehicles = 2 * sum(len(store.ranges) for store in stores)
         problem = "pairs carry no drivers' ids: one driver may be learned from and tested"
-        return Contents(pairs, rows, vehicles, problem)
+        return Contents(pairs, rows, 0, problem, unnamed="leaders and followers have no ids")
 
 
 class _Store(NamedTuple):

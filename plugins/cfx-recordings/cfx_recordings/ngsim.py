@@ -114,6 +114,9 @@ Within one recording the clock and the frame count agree far better.
 
 _FRAME_MS = 1000 * DT
 
+_MOST_FRAMES = 20
+"""Frames of NGSIM that a thinned file leaves out from one row of a vehicle to its next, at most."""
+
 _RECORDED_ON = {
     "2005-04-13": "i-80",
     "2005-06-15": "us-101",
@@ -179,7 +182,7 @@ class Rows(Tracks):
     def trimmed(self, seconds: float) -> Rows:
         """Leaves out the rows within so many seconds of their vehicle's first or last one."""
         since, until = self._since_and_until()
-        near = np.minimum(since, until) < round(seconds / DT)
+        near = np.minimum(since, until) < round(seconds / self.dt)
         if not near.any():
             return self
         reason = f"within {seconds:g} s of their vehicle's first or last row"
@@ -192,7 +195,7 @@ class Rows(Tracks):
         See `NgsimDataset`.
         """
         since, until = self._since_and_until()
-        edge = round(_BOUNDARY_S / DT)
+        edge = round(_BOUNDARY_S / self.dt)
         is_first = since < edge
         is_last = until < edge
         is_between = ~is_first & ~is_last
@@ -251,12 +254,34 @@ def read_ngsim(path: Path, location: str | None = None) -> Rows:
     if again:
         dropped.append(Dropped("the same row again", again, "rows"))
     ordered = {name: values[order] for name, values in columns.items()}
+    frame, step = _frames(str(path), ordered, recording[order], where.codes[row][order])
     rows = _rows(str(path), names, places, recording[order], ordered, count, dropped)
+    rows = replace(rows, frame=frame, dt=step)
     _check_units(rows)
     rows = tracks.vehicles_apart(rows)
     return replace(
         rows, remarks=(*rows.remarks, *statements.remarks_of(_said_twice(rows, ordered)))
     )
+
+
+def _frames(
+    source: str, columns: Mapping[str, Floats], recording: Ints, location: Ints
+) -> tuple[Ints, float]:
+    """Returns the frame of each row `(N,)`, and the time step, s.
+
+    Thinned files keep NGSIM's frames, two or more apart, or number theirs anew; then the clock says
+    how long a frame is.
+    """
+    frame = columns["Frame_ID"].astype(np.int64)
+    vehicle = columns["Vehicle_ID"].astype(np.int64)
+    frame, apart = tracks.frames_apart(source, recording, vehicle, frame)
+    step = DT * apart
+    if apart == 1 and _CLOCK in columns:
+        tick = _tick(columns, location)
+        frames = tick / _FRAME_MS
+        if 1.5 < frames <= _MOST_FRAMES and abs(frames - round(frames)) < 0.1:
+            step = DT * round(frames)
+    return frame, round(step, 9)
 
 
 def _said_twice(rows: Rows, columns: Mapping[str, Floats]) -> Iterator[statements.Statement]:
@@ -373,16 +398,23 @@ def _by_day(columns: Mapping[str, Floats], recording: Ints, count: int) -> tuple
 
 
 def _clock_ticks(columns: Mapping[str, Floats], location: Ints) -> bool:
-    """Says whether `Global_Time` advances by 100 ms from one frame of a vehicle to its next."""
+    """Says whether `Global_Time` advances by 100 ms for each frame of a vehicle."""
+    return abs(_tick(columns, location) - _FRAME_MS) < 0.1 * _FRAME_MS
+
+
+def _tick(columns: Mapping[str, Floats], location: Ints) -> float:
+    """Returns by how much `Global_Time` typically advances in a frame, ms; 0 if nothing says it."""
     clock, frame, vehicle = columns[_CLOCK], columns["Frame_ID"], columns["Vehicle_ID"]
     order = np.lexsort((frame, clock, vehicle, location))
+    steps = np.diff(frame[order])
     successive = (
         (np.diff(vehicle[order]) == 0)
         & (np.diff(location[order]) == 0)
-        & (np.diff(frame[order]) == 1)
+        & (steps >= 1)
+        & (steps <= _MOST_FRAMES)
     )
-    ticks = np.diff(clock[order])[successive]
-    return bool(len(ticks)) and abs(float(np.median(ticks)) - _FRAME_MS) < 0.1 * _FRAME_MS
+    ticks = np.diff(clock[order])[successive] / steps[successive]
+    return float(np.median(ticks)) if len(ticks) else 0.0
 
 
 def _sorted(
@@ -475,6 +507,9 @@ class NgsimDataset(Dataset):
 
     **Several files** hold several recordings, as NGSIM's own downloads do. Where two of them call
     theirs alike, as all three of I-80 are `i-80`, the file's name is put before the recording's.
+
+    **Thinned files** have every second frame alone, or number theirs anew, and the clock then says
+    how long a step is.
 
     **Boundary artefacts of smoothing** (M. Montanino and V. Punzo 2015, Trajectory data
     reconstruction and simulation-based validation against macroscopic traffic patterns,

@@ -7,6 +7,7 @@ Part C 125, 103047. European Commission, Joint Research Centre; CC BY 4.0.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import ClassVar, NamedTuple, TypeVar
@@ -96,7 +97,7 @@ class OpenaccDataset(Dataset):
     def recognises(cls, start: FileStart) -> bool:
         if len(start.lines) <= _LINES:
             return False
-        names = {line.split(",")[0].strip() for line in start.lines[:_LINES]}
+        names = {_cells(line)[0] for line in start.lines[:_LINES]}
         return len(names & set(_KEYS)) >= 3
 
     def read(self) -> PairSet:
@@ -108,6 +109,11 @@ class OpenaccDataset(Dataset):
         rows = sum(len(file.frame) for file in files)
         pairs = joined([_pairs(file) for file in files])
         return Contents(pairs, rows, vehicles, has_gaps=True)
+
+
+def _cells(line: str) -> list[str]:
+    """Returns the cells of a line above the table."""
+    return [cell.strip() for cell in re.split("[,;\t|]", line)]
 
 
 class _File(NamedTuple):
@@ -137,7 +143,7 @@ def _read(path: Path) -> _File:
         )
     about = {}
     for line in start.lines[:_LINES]:
-        key, *values = [cell.strip() for cell in line.split(",")]
+        key, *values = _cells(line)
         about[key.lower()] = [value for value in values if value]
     table = read_table(path, _LAYOUT)
     _check_time(table)

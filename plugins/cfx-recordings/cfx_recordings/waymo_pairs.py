@@ -17,6 +17,7 @@ from cfx.errors import DataError
 from cfx.plugin import (
     Contents,
     Dataset,
+    Dropped,
     FileColumn,
     FileDatasetSettings,
     FileStart,
@@ -109,17 +110,26 @@ def _pairs(file: Table) -> PairSet:
     order = np.lexsort((numbers[_TIME], *keys))
     starts = np.flatnonzero(tracks.changes(*[key[order] for key in keys]))
     series = []
+    alone = 0
     for rows in np.split(order, starts[1:]):
         one = _series(file, {name: values[rows] for name, values in numbers.items()})
-        if one is not None:
+        if one is None:
+            alone += len(rows)
+        else:
             series.append(one)
+    dropped = []
+    if alone:
+        dropped.append(
+            Dropped("the other vehicle of the pair has no row at that time", alone, "rows")
+        )
     said = []
     for name in _OTHER_SPEEDS:
         if name in numbers:
             said.append(
                 statements.Statement(name, numbers[name], [numbers["filter_speed"]], "its speed")
             )
-    return pairs_of(series, file.source, remarks=statements.remarks_of(said))
+    remarks = statements.remarks_of(said)
+    return pairs_of(series, file.source, dropped=dropped, remarks=remarks)
 
 
 def _series(file: Table, rows: Mapping[str, Floats]) -> Series | None:

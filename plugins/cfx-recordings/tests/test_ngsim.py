@@ -601,15 +601,41 @@ def test_files_that_cannot_be_read(rows: pd.DataFrame, tmp_path: Path) -> None:
         file("word.txt", text.replace(b" 30 ", b" -- ", 1)),
         "row 1, column v_Vel: '--' is not a number",
     )
-    says(
-        file("semicolons.csv", rows.to_csv(index=False, sep=";").encode()),
-        "separated by semicolons",
-    )
-    says(
-        file("headless.csv", rows.to_csv(index=False, sep=";", header=False).encode()),
-        "separated by semicolons",
-    )
     packed = gzip.compress(text)
     says(file("cut.txt.gz", packed[: len(packed) // 2]), "gzip file is cut off")
     rows.to_parquet(tmp_path / "f.parquet")
     says(tmp_path / "f.parquet", "is a parquet file")
+
+
+@pytest.mark.parametrize("separator", [";", "\t", "|"])
+def test_other_separators_and_decimal_commas(
+    rows: pd.DataFrame, tmp_path: Path, separator: str
+) -> None:
+    wanted = found(save(rows, tmp_path / "f.csv"))
+    rows.to_csv(tmp_path / "g.csv", index=False, sep=separator, decimal=",")
+    (tmp_path / "g.csv").rename(tmp_path / "f.csv")
+    assert found(tmp_path / "f.csv") == wanted
+
+
+@pytest.mark.parametrize("renumbered", [False, True])
+def test_a_thinned_file_has_the_step_that_its_frames_or_its_clock_say(
+    rows: pd.DataFrame, tmp_path: Path, renumbered: bool
+) -> None:
+    rows = rows[rows["Frame_ID"] % 2 == 0]
+    if renumbered:
+        rows = rows.assign(Frame_ID=rows["Frame_ID"] // 2)
+    path = tmp_path / "thinned.csv"
+    rows.assign(Space_Headway=0, Time_Headway=0).to_csv(path, index=False)
+    pairs = NgsimDataset(path=path, min_duration=0, check="off").load()
+    assert pairs.dt == 0.2
+    assert max(len(pair) for pair in pairs) > 10
+
+
+def test_vehicles_at_different_frames_of_a_thinned_file_are_refused(
+    rows: pd.DataFrame, tmp_path: Path
+) -> None:
+    rows = rows[(rows["Frame_ID"] + rows["Vehicle_ID"]) % 2 == 0]
+    path = tmp_path / "thinned.csv"
+    rows.to_csv(path, index=False)
+    with pytest.raises(DataError, match="not all at the same ones"):
+        NgsimDataset(path=path, min_duration=0).load()

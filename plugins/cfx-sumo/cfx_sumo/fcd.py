@@ -136,6 +136,7 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
         heading=np.radians(numbers["angle"]),
     )
     acceleration = every.accelerations(numbers["acceleration"], dt)
+    remarks = _empty_accelerations(numbers["acceleration"])
     is_oncoming = every.is_oncoming(dt)
     couples = _without(every.passes(), is_oncoming)
     is_parked = every.is_parked(couples) & ~is_oncoming
@@ -151,14 +152,13 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
     length = np.array([lengths_of.get(name, settings.length) for name in types])[kind]
     position, number_of_lane = lanes.position, lanes.lane
     gap: Floats | None = None
-    remarks: tuple[Remark, ...] = ()
     if bool(np.isnan(rows.numbers["leaderGap"]).all()):
         _warn_of_lengths(rows, types, settings)
     else:
         known = {name: number + 1 for number, name in enumerate(names.tolist())}
         named = [known.get(name, tracks.NOBODY) for name in rows.texts["leaderID"][order].tolist()]
         by_name = _Ahead(np.array(named), numbers["leaderGap"][kept], length)
-        remarks = statements.remarks_of(
+        remarks += statements.remarks_of(
             _said_twice(lanes, by_name, numbers["leaderSpeed"][kept], dt)
         )
         leader, gap, length = _as_named(lanes, by_name, leader, beside)
@@ -191,7 +191,21 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
     )
     if gap is not None:
         return vehicles
-    return replace(vehicles, remarks=(*_missing_of_flows(names), *remarks_on_leaders(vehicles)))
+    doubts = (*_missing_of_flows(names), *remarks_on_leaders(vehicles))
+    return replace(vehicles, remarks=(*remarks, *doubts))
+
+
+def _empty_accelerations(recorded: Floats) -> tuple[Remark, ...]:
+    """Returns that some rows have no acceleration, in a file that has them."""
+    empty = int(np.count_nonzero(np.isnan(recorded)))
+    if empty in {0, len(recorded)}:
+        return ()
+    return (
+        Remark(
+            f"{empty:,} of {len(recorded):,} rows have no acceleration: the change of speed over"
+            " the last step stands for it"
+        ),
+    )
 
 
 def _missing_of_flows(names: NDArray[np.str_]) -> tuple[Remark, ...]:

@@ -189,7 +189,7 @@ class Lanes:
 
     def _couple(self, one: Ints, other: Ints) -> Ints:
         """Returns one number for two vehicles, whichever is first, and the lane they are in."""
-        count = int(self.vehicle.max()) + 1
+        count = int(self.vehicle.max(initial=0)) + 1
         first = np.minimum(self.vehicle[one], self.vehicle[other])
         second = np.maximum(self.vehicle[one], self.vehicle[other])
         both: Ints = (self.lane[one] * count + first) * count + second
@@ -272,7 +272,7 @@ class Lanes:
         starts = np.flatnonzero(tracks.changes(own[order]))
         sizes = np.diff(np.append(starts, len(order)))
         medians = left[order][starts + sizes // 2]
-        by_vehicle = np.full(int(self.vehicle.max()) + 1, np.nan)
+        by_vehicle = np.full(int(self.vehicle.max(initial=0)) + 1, np.nan)
         by_vehicle[own[order][starts]] = np.where(medians > 0, np.round(medians, 1), np.nan)
         measured = by_vehicle[self.vehicle]
         return np.where(np.isnan(measured), default, measured)

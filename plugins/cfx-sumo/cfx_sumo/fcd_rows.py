@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from xml.parsers import expat
@@ -24,9 +24,11 @@ from cfx.plugin import (
     Ints,
     Layout,
     Table,
+    beginning,
     open_text,
     read_table,
     tracks,
+    unpacking,
 )
 
 _BLOCK = 1 << 20
@@ -37,6 +39,66 @@ _NUMBERS = (
     *("posLat", "x", "y", "angle"),
 )
 _TEXTS = ("id", "lane", "type", "leaderID")
+
+_OUTPUTS = {
+    "netstate": "--netstate-dump",
+    "trajectories": "--amitran-output",
+    "tripinfos": "--tripinfo-output",
+    "summary": "--summary-output",
+    "emission-export": "--emission-output",
+    "full-export": "--full-output",
+    "routes": "--vehroute-output, or routes",
+    "lanechanges": "--lanechange-output",
+    "stops": "--stop-output",
+    "queue-export": "--queue-output",
+    "battery-export": "--battery-output",
+    "elecHybrid-export": "--elechybrid-output",
+    "chargingstations-export": "--chargingstations-output",
+    "overheadWireSegments-export": "--overheadwiresegments-output",
+    "substations-export": "--substations-output",
+    "statistics": "--statistic-output",
+    "collisions": "--collision-output",
+    "link-output": "--link-output",
+    "bt-output": "--bt-output",
+    "railsignal-block-output": "--railsignal-block-output",
+    "meandata": "--edgedata-output, --lanedata-output or an edgeData element",
+    "detector": "a detector",
+    "instantE1": "an instantaneous induction loop",
+    "SSMLog": "the device ssm",
+    "tlsStates": "a timedEvent of traffic lights",
+    "tlsSwitches": "a timedEvent of traffic lights",
+    "snapshot": "--save-state",
+    "net": "--net-file, which is the road network,",
+    "additional": "no option, as an input,",
+    "sumoConfiguration": "--save-configuration",
+    "configuration": "--save-configuration",
+    "vtypeprobe": "a vTypeProbe",
+    "vehicleTypeProbes": "a vTypeProbe",
+}
+"""Root elements of SUMO's other outputs and of its inputs, and what writes them."""
+
+_COLUMNS_OF_OUTPUTS = {
+    "lane_id;vehicle_id": "netstate",
+    "actorConfig_": "trajectories",
+    "tripinfo_": "tripinfos",
+    "step_": "summary",
+    "interval_": "meandata",
+    "data_timestep": "queue-export",
+    "timestep_id": "link-output",
+    "performance_": "statistics",
+    "stopinfo_": "stops",
+    "change_": "lanechanges",
+    "collision_": "collisions",
+    "route_": "routes",
+    "timestep=": "full-export",
+    "time=": "netstate",
+}
+"""How the first line of their tables begins, and the root element that they are for."""
+
+_INSTEAD = (
+    "pairs are made of positions and speeds over time, which SUMO writes with --fcd-output fcd.xml"
+    " --fcd-output.max-leader-distance 200 --fcd-output.acceleration --precision 6"
+)
 
 _HOW = (
     "write it with --fcd-output.attributes id,type,speed,pos,lane,acceleration,leaderID,leaderGap"
@@ -70,8 +132,25 @@ def is_fcd(start: FileStart) -> bool:
     if start.lines and start.lines[0].lstrip().startswith("<"):
         if "<fcd-export" in "\n".join(start.lines):
             return True
-        return _root(start.path) == "fcd-export"
-    return {"time", *_NEEDED} <= {_plain(name) for name in start.columns}
+        return _root(start.path) in {"fcd-export", *_OUTPUTS}
+    names = set(start.columns)
+    if {"time", *_NEEDED} <= {_plain(name) for name in names} or "timestep_time" in names:
+        return True
+    return bool(_other_table(start))
+
+
+def _other_table(start: FileStart) -> str:
+    """Returns the root element of another output that is a table; "" if it is none of SUMO's."""
+    line = start.lines[0].strip() if start.lines else ";".join(start.columns)
+    for beginning_of, root in _COLUMNS_OF_OUTPUTS.items():
+        if line.startswith(beginning_of) and (";" in line or len(start.columns) == 1):
+            return root
+    return ""
+
+
+def _is_other(path: Path, root: str) -> DataError:
+    """Returns that a file is another output of SUMO."""
+    return DataError(f"{path}: is what SUMO writes with {_OUTPUTS[root]} (<{root}>); {_INSTEAD}")
 
 
 def read_rows(path: Path) -> FcdRows:
@@ -80,12 +159,59 @@ def read_rows(path: Path) -> FcdRows:
     Raises:
         DataError: it is cut off, or is not SUMO's FCD output; or it holds no vehicles.
     """
-    with open_text(path) as file:
+    with open_text(path) as file, unpacking(path):
         is_xml = file.read(_BLOCK).lstrip(b"\xef\xbb\xbf \t\r\n").startswith(b"<")
     rows = _of_xml(path) if is_xml else _of_table(path)
     if not len(rows.step):
         raise DataError(f"{path}: holds no vehicles")
-    return rows
+    back = np.flatnonzero(rows.numbers["speed"] < 0)
+    if len(back):
+        raise DataError(
+            f"{_where(rows, int(back[0]))}: speed={rows.numbers['speed'][back[0]]:g} is negative"
+            f" ({len(back)} such rows); speeds count along the lane"
+        )
+    return _once(rows)
+
+
+def _where(rows: FcdRows, row: int) -> str:
+    """Says where a row is."""
+    time = rows.times[rows.step[row]]
+    return f"{rows.path}, vehicle '{rows.texts['id'][row]}' at {time:g} s"
+
+
+def _once(rows: FcdRows) -> FcdRows:
+    """Returns rows without those that stand there twice.
+
+    Raises:
+        DataError: a vehicle has two different rows at one time.
+    """
+    _, vehicle = np.unique(rows.texts["id"], return_inverse=True)
+    order = np.lexsort((rows.step, vehicle))
+    before, after = order[:-1], order[1:]
+    again = (vehicle[before] == vehicle[after]) & (rows.step[before] == rows.step[after])
+    before, after = before[again], after[again]
+    if not len(after):
+        return rows
+    differs = rows.texts["lane"][before] != rows.texts["lane"][after]
+    for name in _NUMBERS:
+        values = rows.numbers[name]
+        both_empty = np.isnan(values[before]) & np.isnan(values[after])
+        differs |= (values[before] != values[after]) & ~both_empty
+    if differs.any():
+        raise DataError(
+            f"{_where(rows, int(after[differs][0]))}: the vehicle has two different rows"
+            f" ({int(differs.sum())} such pairs of rows); keep one of them"
+        )
+    kept = np.ones(len(rows.step), dtype=bool)
+    kept[after] = False
+    dropped = tracks.count_reasons({"the same row again": ~kept}, "rows")
+    return replace(
+        rows,
+        step=rows.step[kept],
+        numbers={name: values[kept] for name, values in rows.numbers.items()},
+        texts={name: values[kept] for name, values in rows.texts.items()},
+        dropped=(*rows.dropped, *dropped),
+    )
 
 
 # --- XML ------------------------------------------------------------------------------------------
@@ -104,7 +230,7 @@ def _root(path: Path) -> str:
     parser = expat.ParserCreate()
     parser.StartElementHandler = begin
     try:
-        with open_text(path) as file:
+        with open_text(path) as file, unpacking(path):
             while block := file.read(_BLOCK):
                 parser.Parse(block)
     except _Root as found:
@@ -141,8 +267,10 @@ class _Elements:
             for key, texts in self.texts.items():
                 texts.append(attributes.get(key, ""))
         elif not self.times and name != "fcd-export":
+            if name in _OUTPUTS:
+                raise _is_other(self.path, name)
             raise DataError(
-                f"{self.path}: is XML of <{name}>, not SUMO's FCD output (<fcd-export>)"
+                f"{self.path}: is XML of <{name}>, not SUMO's FCD output (<fcd-export>); {_INSTEAD}"
             )
 
     def _number(self, attributes: Mapping[str, str], key: str) -> float:
@@ -172,7 +300,7 @@ def _of_xml(path: Path) -> FcdRows:
     parser.StartElementHandler = elements.begin
     parser.StartDoctypeDeclHandler = refuse
     try:
-        with open_text(path) as file:
+        with open_text(path) as file, unpacking(path):
             while block := file.read(_BLOCK):
                 parser.Parse(block)
         parser.Parse(b"", True)
@@ -181,8 +309,6 @@ def _of_xml(path: Path) -> FcdRows:
             f"{path}, line {error.lineno}: the XML is cut off or damaged"
             f" ({expat.ErrorString(error.code)}); write it again"
         ) from None
-    except EOFError:
-        raise DataError(f"{path}: the gzip file is cut off; write it again") from None
     return FcdRows(
         path,
         np.array(elements.times),
@@ -220,7 +346,6 @@ _LAYOUT = Layout(
         FileColumn("angle", "degrees", may_be_empty=True, needed=False),
     ),
     keys={"vehicle": "id"},
-    separators=(",", ";", "\t", "|"),
     parquet=True,
     plain=_plain,
 )
@@ -232,6 +357,10 @@ def _of_table(path: Path) -> FcdRows:
     Raises:
         DataError: as `read_table`; or a vehicle in a lane has no speed or position.
     """
+    start = beginning(path)
+    other = _other_table(start)
+    if other:
+        raise _is_other(path, other)
     table = read_table(path, _LAYOUT)
     times, step = np.unique(table.numbers["time"], return_inverse=True)
     is_row = table.labels["id"].codes >= 0

@@ -50,10 +50,36 @@ def test_is_recognised_packed_or_not(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 @pytest.mark.parametrize(
+    ("option", "text"),
+    [
+        ("--netstate-dump", "<netstate><timestep time='0'/></netstate>"),
+        ("--amitran-output", "<trajectories timeStepSize='1000'><actorConfig/></trajectories>"),
+        ("--tripinfo-output", "<?xml version='1.0'?>\n<!-- generated -->\n<tripinfos/>"),
+        ("--emission-output", "<emission-export><timestep time='0'/></emission-export>"),
+        ("--netstate-dump", ' time="0.00" id="e"lane_id;vehicle_id;vehicle_pos\ne_0;f.0;5.10\n'),
+        ("--amitran-output", "actorConfig_id;actorConfig_fuel;vehicle_id\n0;gasoline;f.0\n"),
+        ("--tripinfo-output", "tripinfo_id;tripinfo_depart\nf.0;0.00\n"),
+        ("--summary-output", "step_time;step_loaded\n0.00;1\n"),
+    ],
+)
+def test_another_output_of_sumo_names_the_option_that_writes_this_one(
+    tmp_path: Path, option: str, text: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "out"
+    path.write_text(text)
+    assert main(["data", "describe", str(path)]) == 2
+    said = capsys.readouterr().err
+    assert f"is what SUMO writes with {option}" in said
+    assert "SUMO writes with --fcd-output fcd.xml" in said
+
+
+@pytest.mark.parametrize(
     ("text", "says"),
     [
         ("<fcd-export><timestep", "the XML is cut off or damaged"),
-        ("<routes><vehicle/></routes>", "is XML of <routes>, not SUMO's FCD output"),
+        ("<gpx><trk/></gpx>", "is XML of <gpx>, not SUMO's FCD output"),
+        ("<routes><vehicle/></routes>", "writes with --vehroute-output"),
+        ("<netstate/>", "writes with --netstate-dump .*which SUMO writes with --fcd-output"),
         ("<!DOCTYPE x [<!ENTITY a 'b'>]><fcd-export/>", "has a DOCTYPE"),
         ("<fcd-export/>", "holds no vehicles"),
         (

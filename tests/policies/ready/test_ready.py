@@ -133,12 +133,16 @@ def test_an_unknown_one_is_one_sentence() -> None:
 
 
 def test_the_command_lists_and_shows_them(capsys: pytest.CaptureFixture[str]) -> None:
-    assert cli.main(["policies"]) == 0
-    listed = capsys.readouterr().out
-    for name in NAMES:
-        assert f"cfx://{name}" in listed
+    for words in (["policies"], ["policies", "list"]):
+        assert cli.main(words) == 0
+        listed = capsys.readouterr().out
+        for name in NAMES:
+            assert f"cfx://{name}" in listed
     assert cli.main(["policies", "show", NAMES[0]]) == 0
-    assert capsys.readouterr().out.startswith(f"# {NAMES[0]}")
+    card = capsys.readouterr().out
+    assert card.startswith(f"# {NAMES[0]}")
+    assert cli.main(["policies", "show", f"cfx://{NAMES[0]}"]) == 0
+    assert capsys.readouterr().out == card
     assert cli.main(["policies", "show", "nobody"]) == 2
 
 

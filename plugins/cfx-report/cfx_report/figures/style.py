@@ -71,7 +71,11 @@ def _histogram(axes: Axes, of_drivers: StyleResult) -> None:
     axes.set_xlabel(title)
     axes.set_ylabel("drivers")
     axes.legend(
-        loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3, handlelength=1.0, columnspacing=1.4
+        loc="lower center",
+        bbox_to_anchor=(0.5, 1.0),
+        ncols=canvas.most_across(3),
+        handlelength=1.0,
+        columnspacing=1.4,
     )
 
 
