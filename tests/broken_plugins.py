@@ -277,7 +277,7 @@ BROKEN = (
         "miscounts",
         "optimizers",
         _OPTIMIZER.format("return candidates[:, :3], objective(candidates[:, :3])"),
-        r"solve must return candidates \(2, 4, 2\) and losses \(2, 4\) as evaluations\(\) says,"
+        r"solve must return candidates \(2, 4, 2\) and losses \(2, 4\) as returned\(\) says,"
         r" but returned \(2, 3, 2\)",
     ),
     Broken(
@@ -309,7 +309,7 @@ BROKEN = (
         "uncounted",
         "optimizers",
         _OPTIMIZER.format("return None").replace("return 4", "return 4.5"),
-        r"evaluations\(\) gives 4\.5; it must give a whole number",
+        r"evaluations\(n\) gives 4\.5; it must give a whole number",
     ),
     Broken(
         "no_stepper",

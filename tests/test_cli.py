@@ -29,6 +29,7 @@ JOB = """
     import logging, os, signal, sys, time
     from dataclasses import dataclass
     from cfx.errors import DataError
+    from cfx.evaluation.metrics.base import RMSE_SPEED
 
     log = logging.getLogger("cfx.jobs_stub")
 
@@ -37,6 +38,7 @@ JOB = """
         metrics: dict
         folder: object
         config: object
+        judge = RMSE_SPEED
 
     def run_job(config, folder):
         log.info("driving %s", config.model["name"])
@@ -147,8 +149,8 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
             "'data.columns.pairid'. Did you mean 'data.columns.pair_id'? Known keys of",
         ),
         (
-            ["experiment=every_road", "data.site={A*: A}"],
-            "To replace all of them: '~data.site' '+data.site={A*: A}'",
+            ["model.parameters={A: 1}"],
+            "To replace all of them: '~model.parameters' '+model.parameters={A: 1}'",
         ),
         (["modle=w99", "policy=nope"], "policy=nope: there is no policy 'nope'."),
         (["seed=-1"], "seed=-1: should be greater than or equal to 0."),
@@ -329,7 +331,7 @@ def test_every_command_that_a_text_names_exists() -> None:
         is_override = "=" in first or first.isupper() or first.startswith("-")
         assert is_override or first in registry.names("command"), f"{where} names cfx {words}"
         if first in {"plugins", "data"} and further and further[0].isalpha():
-            assert further[0] in {"check", "show", "new", "describe", "fetch"}, f"{where}: {words}"
+            assert further[0] in {"check", "show", "new", "describe", "fetch", "flows"}, f"{where}: {words}"
 
 
 @pytest.mark.parametrize(

@@ -87,7 +87,7 @@ def _moved(data: TrainingData) -> TrainingData:
     pairs = replace(
         data.pairs,
         index=data.pairs.index.to(DEVICE),
-        fixed=data.pairs.start.to(DEVICE),
+        start=data.pairs.start.to(DEVICE),
         network=data.pairs.network.to(DEVICE),
     )
     return replace(data, recorded=replace(data.recorded, **recorded), pairs=pairs)

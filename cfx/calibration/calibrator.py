@@ -26,6 +26,7 @@ from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import Optimizer
 from cfx.calibration.settings import APART
 from cfx.calibration.shards import CalibrationShard, PooledShard, SegmentShard, Solver
+from cfx.calibration.strength import FITTED, MOST, WEIGHTS, PriorStrength
 from cfx.core import memory
 from cfx.core.component import content_key
 from cfx.core.engine import Engine
@@ -121,6 +122,11 @@ class WindowLabels:
         return pd.DataFrame(columns)
 
 
+def _silent(description: str, _total: int) -> Task:
+    """Makes a progress display that shows nothing."""
+    return Task(description, 0)
+
+
 class Calibrator:
     """Calibrates one model with one optimizer.
 
@@ -129,6 +135,7 @@ class Calibrator:
         cache: where results are kept.
         progress: makes a progress display, given a description and a total.
         reported: objectives by name whose losses `losses` reports beside the minimised one.
+        strengths: of the prior, as they were chosen.
         engine: solves the problems, shard by shard; this machine's cores unless given.
     """
 
@@ -146,7 +153,8 @@ class Calibrator:
         self.progress = progress
         self.reported = reported or {}
         self.engine = engine or LocalEngine()
-        self._apart: dict[str, float] = {}
+        self.strengths: list[PriorStrength] = []
+        self._apart: dict[tuple[str, int], float] = {}
 
     @property
     def space(self) -> ParameterSpace:
@@ -171,10 +179,42 @@ class Calibrator:
         Returns:
             `(P, n)`, SI units.
         """
+        fitted = self
+        if self.solver.chooses_prior:
+            fitted = self._with_prior(self.prior_strength(pairs, batch, last).weight, self.progress)
+        found, apart = fitted.searched(pairs, batch, last)
+        for pair, end, share in zip(pairs, last.tolist(), apart, strict=True):
+            self._apart[pair.fingerprint, end] = share
+        missed = [pair.pair_id for pair, share in zip(pairs, apart, strict=True) if share > APART]
+        if missed:
+            named = ", ".join(missed[:_NAMED]) + (" ..." if len(missed) > _NAMED else "")
+            log.warning(
+                "The optimum of %d of %d pairs may have been missed (%s): independent ends of the"
+                " search differ by more than %.0f %% of the loss (ends_apart in fits.parquet);"
+                " there may be several ways to drive like them",
+                len(missed),
+                len(pairs),
+                named,
+                100 * APART,
+            )
+        return found
+
+    def searched(
+        self, pairs: PairSet, batch: PairBatch, last: Tensor
+    ) -> tuple[Tensor, list[float]]:
+        """Returns each pair's parameters with the solver's prior, and how far its ends were apart.
+
+        Args:
+            pairs, batch, last: as in `driver_specific`.
+        """
         requested_device, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         last = last.to(device)
-        keys = self._keys_of_own(pairs, last)
+        keys = []
+        for pair, end in zip(pairs, last.tolist(), strict=True):
+            keys.append(
+                self._key("driver_specific", pair.fingerprint, frames=end, **self._prior_key)
+            )
         compiled = self._has_kernel(batch)
 
         def shard(chosen: Tensor, claim: Tensor) -> SegmentShard:
@@ -193,22 +233,61 @@ class Calibrator:
         title = "Driver-specific parameters"
         sizes = [1] * len(pairs)
         results = self._cached(title, keys, sizes, shard, at_most=_TRAJECTORIES_OF_SHARD)
-        for key, entry in zip(keys, results, strict=True):
-            self._apart[key] = float(entry.get("apart", math.nan))
-        apart = self.apart(pairs, last)
-        missed = [pair.pair_id for pair, share in zip(pairs, apart, strict=True) if share > APART]
-        if missed:
-            named = ", ".join(missed[:_NAMED]) + (" ..." if len(missed) > _NAMED else "")
-            log.warning(
-                "The optimum of %d of %d pairs may have been missed (%s): independent ends of the"
-                " search differ by more than %.0f %% of the loss (ends_apart in fits.parquet);"
-                " there may be several ways to drive like them",
-                len(missed),
-                len(pairs),
-                named,
-                100 * APART,
-            )
-        return _stacked(results, requested_device)
+        apart = [float(entry.get("apart", math.nan)) for entry in results]
+        return _stacked(results, requested_device), apart
+
+    def prior_strength(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> PriorStrength:
+        """Tries how strong a prior serves driver-specific parameters best.
+
+        They are calibrated on the first two thirds of what may be used, and drive the rest from the
+        measured state there; nothing after `last` is read.
+
+        Args:
+            pairs, batch, last: as in `driver_specific`.
+        """
+        step = max(1, -(-len(pairs) // MOST))
+        chosen = torch.arange(0, len(pairs), step)
+        which = torch.zeros(len(pairs), dtype=torch.bool)
+        which[chosen] = True
+        some = pairs.select(which.tolist(), "not tried")
+        tried, end = batch[chosen.to(batch.lengths.device)], last.cpu()[chosen]
+        cut = (FITTED * end).long().clamp(min=1)
+        errors = {}
+        for weight in WEIGHTS:
+            own, _ = self._with_prior(weight, _silent).searched(some, tried, cut)
+            held_out = self._held_out_losses(tried, cut, end, own)
+            errors[weight] = float(held_out.log().nanmean().exp())
+        strength = PriorStrength(errors, len(some))
+        self.strengths.append(strength)
+        log.info(strength.worded(self.solver.objective.unit))
+        return strength
+
+    @torch.no_grad()
+    def _held_out_losses(
+        self, batch: PairBatch, first: Tensor, last: Tensor, parameters: Tensor
+    ) -> Tensor:
+        """Returns the loss of each pair's parameters from a measured state on, `(P,)`.
+
+        NaN where it is 0 or not finite.
+        """
+        device = batch.lengths.device
+        pair = torch.arange(len(batch), device=device)
+        steps = (last - first).to(device)
+        losses = self.solver.segments(batch, pair, first.to(device), steps)
+        unit = self.space.to_unit(parameters.to(device))[:, None]
+        found = losses(unit)[:, 0].double()
+        return torch.where(found.isfinite() & (found > 0), found, torch.nan)
+
+    def _with_prior(self, weight: float, progress: Callable[[str, int], Task]) -> Calibrator:
+        """Returns the same calibrator with another weight of the prior."""
+        solver = replace(self.solver, prior=weight, chooses_prior=False)
+        return Calibrator(
+            solver,
+            cache=self.cache,
+            progress=progress,
+            reported=self.reported,
+            engine=self.engine,
+        )
 
     def apart(self, pairs: Iterable[Pair], last: Tensor) -> list[float]:
         """Returns how far the ends of the search of each pair's parameters were apart.
@@ -220,15 +299,8 @@ class Calibrator:
             pairs: P pairs.
             last: `(P,)`, as in `driver_specific`.
         """
-        return [self._apart.get(key, math.nan) for key in self._keys_of_own(pairs, last)]
-
-    def _keys_of_own(self, pairs: Iterable[Pair], last: Tensor) -> list[str]:
-        keys = []
-        for pair, end in zip(pairs, last.tolist(), strict=True):
-            keys.append(
-                self._key("driver_specific", pair.fingerprint, frames=end, **self._prior_key)
-            )
-        return keys
+        ends = zip(pairs, last.tolist(), strict=True)
+        return [self._apart.get((pair.fingerprint, end), math.nan) for pair, end in ends]
 
     def pooled(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
         """Finds one parameter set for each of K groups of pairs: the pooled parameters.

@@ -50,6 +50,7 @@ class Solver:
         memory: bound for one shard, bytes.
         prior: weight of the prior on driver-specific and pooled parameters
             (`cfx.calibration.losses`); 0: none. Labels have none: ties go to the driver's own set.
+        chooses_prior: that of driver-specific ones is chosen (`cfx.calibration.strength`).
     """
 
     stepper: Stepper
@@ -58,6 +59,7 @@ class Solver:
     objective: Objective = field(default_factory=SpeedRmse)
     memory: int = 1 << 30
     prior: float = 0.0
+    chooses_prior: bool = False
 
     @property
     def space(self) -> ParameterSpace:

@@ -316,6 +316,7 @@ def compose(
         objective=components.objective,
         memory=bound,
         prior=prior_weight(config.calibration.prior),
+        chooses_prior=config.calibration.prior == "chosen",
     )
     reported = {}
     for entry in registry.entries("objective"):  # cfx's own and the chosen one
@@ -390,7 +391,7 @@ def find(context: ProtocolContext, components: JobComponents, config: JobConfig)
     return Result.of(
         evaluation,
         config=config.model_dump(mode="json"),
-        data=description(context.pairs, delivered, config, components),
+        data=description(context, delivered, config, components),
         metrics=metrics,
         trained=delivered.policy,
     )
@@ -410,9 +411,13 @@ def job_tables(
 
 
 def description(
-    pairs: PairSet, delivered: ProtocolResult, config: JobConfig, components: JobComponents
+    context: ProtocolContext,
+    delivered: ProtocolResult,
+    config: JobConfig,
+    components: JobComponents,
 ) -> dict[str, Any]:
     """Returns what `data.json` says of the data and the job; the evaluation says the rest."""
+    pairs = context.pairs
     dropped = []
     for drop in pairs.dropped:
         dropped.append({"reason": drop.reason, "count": drop.count, "unit": drop.unit})
@@ -422,6 +427,7 @@ def description(
         "pairs": len(pairs),
         "protocol": dict(delivered.notes),
         "dropped": dropped,
+        "priors": [strength.to_json() for strength in context.calibrator.strengths],
         "objective": {**config.objective, "unit": components.objective.unit},
         "cfx": version(),
         "commit": commit(Path.cwd()),

@@ -70,7 +70,7 @@ class ParameterPrior:
     precision: Tensor
 
     @classmethod
-    def of(cls, space: ParameterSpace, name: Literal["weak", "none"]) -> ParameterPrior:
+    def of(cls, space: ParameterSpace, name: Literal["weak", "chosen", "none"]) -> ParameterPrior:
         """Returns the prior that `calibration.prior` names.
 
         Weak: around the model's defaults. None: uniform between the bounds.
