@@ -331,7 +331,9 @@ def test_every_command_that_a_text_names_exists() -> None:
         is_override = "=" in first or first.isupper() or first.startswith("-")
         assert is_override or first in registry.names("command"), f"{where} names cfx {words}"
         if first in {"plugins", "data"} and further and further[0].isalpha():
-            assert further[0] in {"check", "show", "new", "describe", "fetch", "flows"}, f"{where}: {words}"
+            assert further[0] in {"check", "show", "new", "describe", "fetch", "flows"}, (
+                f"{where}: {words}"
+            )
 
 
 @pytest.mark.parametrize(

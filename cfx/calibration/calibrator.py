@@ -122,6 +122,11 @@ class WindowLabels:
         return pd.DataFrame(columns)
 
 
+_LEAST_LOSS = 1e-3
+"""Share of an objective's floor (at least this, in its unit) that a smaller loss counts as: drivers
+who stand are followed without any error, which has no logarithm."""
+
+
 def _silent(description: str, _total: int) -> Task:
     """Makes a progress display that shows nothing."""
     return Task(description, 0)
@@ -252,12 +257,17 @@ class Calibrator:
         some = pairs.select(which.tolist(), "not tried")
         tried, end = batch[chosen.to(batch.lengths.device)], last.cpu()[chosen]
         cut = (FITTED * end).long().clamp(min=1)
-        errors = {}
+        by_weight = []
         for weight in WEIGHTS:
             own, _ = self._with_prior(weight, _silent).searched(some, tried, cut)
-            held_out = self._held_out_losses(tried, cut, end, own)
-            errors[weight] = float(held_out.log().nanmean().exp())
-        strength = PriorStrength(errors, len(some))
+            by_weight.append(self._held_out_losses(tried, cut, end, own))
+        losses = torch.stack(by_weight)
+        is_known = losses.isfinite().all(0)  # the same drivers count for each weight
+        least = max(_LEAST_LOSS * self.solver.objective.floor, _LEAST_LOSS)
+        means = losses[:, is_known].clamp(min=least).log().mean(1).exp()
+        strength = PriorStrength(
+            dict(zip(WEIGHTS, means.tolist(), strict=True)), int(is_known.sum())
+        )
         self.strengths.append(strength)
         log.info(strength.worded(self.solver.objective.unit))
         return strength
@@ -266,17 +276,13 @@ class Calibrator:
     def _held_out_losses(
         self, batch: PairBatch, first: Tensor, last: Tensor, parameters: Tensor
     ) -> Tensor:
-        """Returns the loss of each pair's parameters from a measured state on, `(P,)`.
-
-        NaN where it is 0 or not finite.
-        """
+        """Returns the loss of each pair's parameters from a measured state on, `(P,)`."""
         device = batch.lengths.device
         pair = torch.arange(len(batch), device=device)
         steps = (last - first).to(device)
         losses = self.solver.segments(batch, pair, first.to(device), steps)
         unit = self.space.to_unit(parameters.to(device))[:, None]
-        found = losses(unit)[:, 0].double()
-        return torch.where(found.isfinite() & (found > 0), found, torch.nan)
+        return losses(unit)[:, 0].double()
 
     def _with_prior(self, weight: float, progress: Callable[[str, int], Task]) -> Calibrator:
         """Returns the same calibrator with another weight of the prior."""

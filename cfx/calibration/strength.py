@@ -68,6 +68,11 @@ class PriorStrength:
 
     def worded(self, unit: str) -> str:
         """Returns the choice and what it was chosen from, as a sentence."""
+        if not self.pairs:
+            return (
+                f"The prior of driver-specific parameters has the weight {self.weight:g}: no pair"
+                " can be driven on the last third of what is calibrated on"
+            )
         tried = [f"{weight:g}: {error:.3f}" for weight, error in self.errors.items()]
         shown = f"{listed(tried, len(tried))} {unit}".rstrip()
         return (

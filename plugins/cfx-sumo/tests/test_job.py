@@ -49,8 +49,9 @@ def job(folder: Path, *overrides: str) -> Any:
 
 @needs_sumo
 def test_the_table_is_the_same_with_sumo_in_the_loop(tmp_path: Path) -> None:
-    memory = job(tmp_path / "memory", "model=krauss_sumo")
-    sumo = job(tmp_path / "sumo", "model=krauss_sumo", "simulator=sumo", "simulator.followers=8")
+    same = ("model=krauss_sumo", "calibration.prior=weak")
+    memory = job(tmp_path / "memory", *same)
+    sumo = job(tmp_path / "sumo", *same, "simulator=sumo", "simulator.followers=8")
     # Slices of the loss, which flatness is read from, are not simulated in SUMO.
     slices = [name for name in memory.pairs if name.startswith("flat_")]
     assert slices
