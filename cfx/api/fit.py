@@ -213,7 +213,8 @@ class Fit:
         Args:
             name: `parameters`: between their bounds, and how they go together; `drives`: measured
                 against simulated speed and gap on the test part; or another figure of a job
-                (`cfx plugins` lists them), such as `fan` where a posterior was asked for.
+                (`cfx plugins` lists them), such as `posterior_fan` where a posterior was
+                asked for.
             pair_id: of `drives`: which pairs; None: the best, the median and the worst.
 
         Raises:

@@ -25,8 +25,8 @@ FITTED = 2 / 3
 """Share of the part that may be used that is calibrated on; the rest is held out."""
 
 MOST = 32
-"""Pairs that are tried at most: those evenly spread over all. 32 drivers' mean error differs from
-that of all by a fraction of what the weights differ by."""
+"""Pairs that are tried at most, those evenly spread over all: so a large recording costs little
+more than its own calibration."""
 
 
 @dataclass(frozen=True)

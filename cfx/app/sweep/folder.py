@@ -114,16 +114,21 @@ def metrics_of(folder: Path) -> dict[str, float]:
     return {name: value for name, value in found.items() if math.isfinite(value)}
 
 
-def judge_of_folder(folder: Path) -> MetricInfo:
-    """Returns the error by which a finished job is judged."""
+def data_of(folder: Path) -> dict[str, Any]:
+    """Returns what `data.json` of a finished job says; empty if there is none."""
     from cfx.core.job_folder import read_json
-    from cfx.results.result import judge_of
 
     try:
-        data = read_json(folder / "data.json")
+        return read_json(folder / "data.json")
     except DataError:
-        data = {}
-    return judge_of(data, metrics_of(folder))
+        return {}
+
+
+def judge_of_folder(folder: Path) -> MetricInfo:
+    """Returns the error by which a finished job is judged."""
+    from cfx.results.result import judge_of
+
+    return judge_of(data_of(folder), metrics_of(folder))
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from cfx.app.sweep.folder import JobStatus, metrics_of
+from cfx.app.sweep.folder import JobStatus, data_of, metrics_of
 from cfx.core.console import blank_table
 from cfx.core.files import atomic_write
-from cfx.core.job_folder import read_json
-from cfx.errors import DataError
 from cfx.evaluation.headline import doubts, judged_method, main_comparison
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.statistics import Ranking, ranking_of
@@ -53,12 +51,9 @@ class SweptJob:
     @classmethod
     def read(cls, folder: Path, status: JobStatus) -> SweptJob:
         """Reads what a job left; damaged files are as if they were not there."""
-        data: Mapping[str, Any] = {}
         if status.code:
-            return cls(folder, status, data, {})
-        with suppress(DataError):
-            data = read_json(folder / "data.json")
-        return cls(folder, status, data, metrics_of(folder))
+            return cls(folder, status, {}, {})
+        return cls(folder, status, data_of(folder), metrics_of(folder))
 
     @cached_property
     def overrides(self) -> dict[str, str]:
