@@ -157,7 +157,8 @@ def closeness(jobs: Sequence[Result]) -> Sheet:
     judge = judge_of(jobs)
     other = "rmse_gap" if judge.name == "rmse_speed" else "rmse_speed"
     below = "the RMSE of the gap in m" if other == "rmse_gap" else "the RMSE of speed in m/s"
-    jobs, columns = _by_error(jobs), [_JOB]
+    ranking = comparison_of(jobs).ranking
+    jobs, columns = _by_error(jobs, ranking.jobs), [_JOB]
     for scope, group in (
         (wording.TEST, f"Test part: {metric_title(judge)}, below it {below}"),
         (wording.FULL_TRAJECTORY, "Full trajectories: the same"),
@@ -181,16 +182,20 @@ def closeness(jobs: Sequence[Result]) -> Sheet:
             heading = f"over {wording.short_label(baseline)}{suffix}"
             cell = partial(_gain, baseline=baseline, scope=scope)
             columns.append(Column(heading, cell, meaning, "Improvement of the policy"))
-    return _with_best(Sheet.of(columns, jobs), jobs)
+    sheet = Sheet.of(columns, jobs)
+    return _with_best(sheet, jobs[0].judged) if ranking.against else sheet
 
 
-def _by_error(jobs: Sequence[Result]) -> list[Result]:
+def _by_error(jobs: Sequence[Result], ranked: Sequence[str]) -> list[Result]:
     """Returns the jobs that were tested on the same frames, the smallest error first; then others.
 
     The error is that of the method that a job is judged by, the mean over seeds.
+
+    Args:
+        jobs: in any order.
+        ranked: names of their rows over seeds, the smallest error first.
     """
     places: dict[str, int] = {}
-    ranked = comparison_of(jobs).ranking.jobs
     for row in rows_over_seeds(jobs):
         for job in row.jobs:
             places[job.name] = ranked.index(row.name) if row.name in ranked else len(ranked)
@@ -288,11 +293,9 @@ def _with_baseline(job: Result, metric: str, scope: str, baseline: str, form: st
     return number(job.metric(metric, job.judged, scope), form, second)
 
 
-def _with_best(sheet: Sheet, jobs: Sequence[Result]) -> Sheet:
-    """Marks the smallest error of the methods that jobs are judged by, where jobs are ranked."""
-    if len(jobs) < 2 or not comparison_of(jobs).ranking.against:
-        return sheet
-    best = wording.short_label(jobs[0].judged)
+def _with_best(sheet: Sheet, method: str) -> Sheet:
+    """Marks the first job's error of the method that it is judged by, which is the smallest."""
+    best = wording.short_label(method)
     cells = list(sheet.rows[0])
     for place, column in enumerate(sheet.columns):
         if column.heading == best:  # of the test part, which stands before full trajectories
