@@ -188,7 +188,7 @@ class NeighboursSettings(LaggedSettings):
 class NeighboursRival(LaggedRival):
     """What drivers did in the most similar moments, in the mean."""
 
-    reference = "He, Zheng and Guan (2015), Transp. Res. B 82, 21-38"
+    reference = "He, Zheng and Guan (2015), Transp. Res. B 80, 185-201"
     schema: ClassVar[type[Settings]] = NeighboursSettings
     settings: NeighboursSettings
 

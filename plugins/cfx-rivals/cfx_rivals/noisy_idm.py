@@ -78,7 +78,10 @@ class NoisyIdm(Rival):
 class ArIdm(NoisyIdm):
     """IDM with autoregressive noise; its weights are those of Yule and Walker's equations."""
 
-    reference = "Zhang, Wang and Sun (2024), IEEE Trans. Intell. Transp. Syst. 25(10): dynamic IDM"
+    reference = (
+        "Zhang, Wang and Sun (2024), Calibrating car-following models via Bayesian dynamic"
+        " regression, Transp. Res. C"
+    )
 
     def noise(self, covariances: Floats) -> Noise:
         return _given_covariances(covariances)
@@ -87,7 +90,10 @@ class ArIdm(NoisyIdm):
 class MaIdm(NoisyIdm):
     """Memory-augmented IDM: noise with a squared-exponential kernel, fitted to covariances."""
 
-    reference = "Zhang and Sun (2024), Transp. Res. B: Bayesian calibration of the IDM with memory"
+    reference = (
+        "Zhang and Sun (2024), Bayesian calibration of the intelligent driver model, IEEE Trans."
+        " Intell. Transp. Syst. 25"
+    )
 
     def noise(self, covariances: Floats) -> Noise:
         lags: Floats = STEP_S * np.arange(len(covariances), dtype=np.float64)

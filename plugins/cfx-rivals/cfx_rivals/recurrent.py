@@ -61,7 +61,7 @@ class RecurrentDriver(NetworkDriver):
 class DirectGru(RolloutRival):
     """A GRU that sets the acceleration, trained through its own driving."""
 
-    reference = "Wang, Jiang, Li, Lin and Wang (2018), IEEE Trans. Intell. Transp. Syst. 19(3)"
+    reference = "Wang et al. (2018), IEEE Trans. Intell. Transp. Syst. 19(3), 910-920"
 
     def network(self) -> NetworkDriver:
         return RecurrentDriver(nn.GRUCell(FEATURES, self.settings.hidden_size))

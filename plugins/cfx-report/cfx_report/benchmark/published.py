@@ -29,6 +29,7 @@ class Published:
 
     Attributes:
         title: what it is.
+        pairs: how many are tested; None: it depends on the recording.
         source: where its files are.
         metrics: what its authors report, of those that `scores` gives.
         rows: their numbers, in the order of `metrics`.
@@ -36,6 +37,7 @@ class Published:
     """
 
     title: str
+    pairs: int | None
     source: str
     metrics: tuple[str, ...]
     rows: tuple[tuple[str, tuple[float, ...]], ...]
@@ -44,7 +46,8 @@ class Published:
 
 SPLITS = {
     "segments": Published(
-        title="segment-based calibration, 20 test pairs of reconstructed I-80",
+        title="Segment-based calibration, test pairs of reconstructed I-80",
+        pairs=20,
         source="the authors' repository: per-pair CSV files; the test pairs are listed there",
         metrics=("rmse_gap", "rmse_speed"),
         rows=(
@@ -55,7 +58,8 @@ SPLITS = {
         note="whole trajectories, means over pairs",
     ),
     "transfollower": Published(
-        title="TransFollower, 202 events of 15 s of NGSIM",
+        title="TransFollower, events of 15 s of NGSIM",
+        pairs=202,
         source="github.com/MeixinZhu/TransFollower, data/raw_data",
         metrics=("mse_sum",),
         rows=(
@@ -69,6 +73,7 @@ SPLITS = {
     ),
     "follownet": Published(
         title="FollowNet, test events",
+        pairs=None,
         source="github.com/HKUST-DRIVE-AI-LAB/FollowNet",
         metrics=("mse_gap", "collision_share"),
         rows=(),
@@ -169,9 +174,14 @@ def lines(split: Published, name: str, found: pd.DataFrame) -> list[str]:
         "mse_sum": "MSE of speed and gap, summed",
         "collision_share": "share with a collision",
     }
-    lines = [
-        f"{split.title}: {len(found)} pairs; {split.note}",
-        "",
+    lines = [f"{split.title}: {len(found)} pairs; {split.note}", ""]
+    if split.pairs not in {None, len(found)}:
+        lines[-1:] = [
+            f"These are {len(found)} pairs, and {split.pairs} were published: they are others, and"
+            f" the published numbers do not compare. {split.source}.",
+            "",
+        ]
+    lines += [
         f"| row | {' | '.join(heads[metric] for metric in split.metrics)} |",
         "|" + " --- |" * (1 + len(split.metrics)),
     ]

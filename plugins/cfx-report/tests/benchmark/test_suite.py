@@ -342,6 +342,7 @@ def test_what_is_tested_on_a_published_split_is_not_learned_from(recordings: Rec
     np.testing.assert_allclose(found["mse_sum"], found["rmse_speed"] ** 2 + found["rmse_gap"] ** 2)
     text = "\n".join(published.lines(published.SPLITS["transfollower"], "r", found))
     assert "| IDM, theirs | 17.650 |" in text
+    assert "These are 2 pairs, and 202 were published" in text
     with pytest.raises(DataError, match="nothing is left to learn from"):
         published.scores(entry, tested, tested, 0)
     with pytest.raises(ConfigError, match="has to learn"):
