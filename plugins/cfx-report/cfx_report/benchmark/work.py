@@ -136,7 +136,7 @@ def write_row(
             table = predictions.read(folder / file)
             parts.append(errors_of(suite, tested, table, str(folder / file)))
             if file == predictions.TRAJECTORIES:
-                drives = _drives(tested, table, parts[-1])
+                drives = _drives(suite, tested, table, parts[-1])
     errors = pd.concat(parts, ignore_index=True)
     if drives is not None:
         predictions.write(drives, folder / DRIVES)
@@ -166,12 +166,15 @@ _SHOWN = {"best": 0.0, "median": 0.5, "worst": 1.0}
 """Pairs that a page shows of each row, by the rank of their error in the first task."""
 
 
-def _drives(pairs: PairSet, table: pd.DataFrame, errors: pd.DataFrame) -> pd.DataFrame:
-    """Returns what three pairs drove beside the recording.
+def _drives(
+    suite: Suite, pairs: PairSet, table: pd.DataFrame, errors: pd.DataFrame
+) -> pd.DataFrame:
+    """Returns what three pairs of the first task drove beside the recording.
 
     Columns: drive, site, rmse_speed (m/s), time_s, leader, recorded, driven (m/s).
     """
-    task = errors["task"].iloc[0]
+    answered = set(errors["task"])
+    task = next(task.name for task in suite.tasks if task.name in answered)
     ranked = errors[errors["task"] == task].sort_values("rmse_speed", ignore_index=True)
     by_id = {pair.pair_id: pair for pair in pairs}
     parts = []

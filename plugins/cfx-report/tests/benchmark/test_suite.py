@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -304,6 +305,13 @@ def test_scores_are_relative_to_the_baseline(rows: list[Path]) -> None:
 def test_the_page_is_one_file_with_drives(rows: list[Path]) -> None:
     page = render([Entered.read(folder) for folder in rows])
     assert page.count("<svg") == 2
+    drives = pd.read_parquet(rows[0] / "drives.parquet")
+    errors = pd.read_csv(rows[0] / "benchmark_pairs.csv")
+    of_task = errors[errors["task"] == "new_road"]["rmse_speed"]
+    assert drives["rmse_speed"].max() == pytest.approx(of_task.max())
+    worst = drives[drives["drive"] == "worst"]
+    square = (worst["driven"] - worst["recorded"]) ** 2
+    assert math.sqrt(square.mean()) == pytest.approx(of_task.max())
     assert page.count('class="sortable') == 8
     assert "http" not in page.replace("http://www.w3.org", "").replace("http-equiv", "")
     assert "late" in page
