@@ -101,7 +101,7 @@ def lines(found: pd.DataFrame) -> list[str]:
             here["site"].tolist(),
         )
         means = rows.groupby("site")[["rmse_speed", "rmse_gap"]].mean().mean()
-        percent = [f"{100 * value:+.1f}" for value in gain[:3]]
+        percent = [f"{100 * value + 0.0:+.1f}" for value in gain[:3]]  # not -0.0
         table.append(
             f"| {seconds:g} | {means['rmse_speed']:.3f} | {means['rmse_gap']:.2f} |"
             f" {percent[0]} % ({percent[1]} to {percent[2]}) |"
