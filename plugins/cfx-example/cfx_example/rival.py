@@ -23,6 +23,7 @@ class MeanTimeGap(Rival):
 
     reference = "this file"
     schema = TimeGapSettings
+    settings: TimeGapSettings
 
     def fit(self, pairs: PairSet, seed: int) -> Driver:
         batch = PairBatch.of(pairs)  # tensors `(P, T)`; `mask` says which frames there are

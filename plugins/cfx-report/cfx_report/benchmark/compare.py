@@ -103,9 +103,10 @@ def lines_of(found: dict[tuple[str, str], Improvement]) -> list[str]:
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for (row, metric), one in found.items():
-        interval = f"{one.ci95_low:+.1%} to {one.ci95_high:+.1%}"
+        # 0.0 is added so that no difference is +0.0 %, not -0.0 %.
+        interval = f"{one.ci95_low + 0.0:+.1%} to {one.ci95_high + 0.0:+.1%}"
         lines.append(
-            f"| {row} | {metric} | {one.geometric:+.1%} | {interval} |"
+            f"| {row} | {metric} | {one.geometric + 0.0:+.1%} | {interval} |"
             f" {one.win_rate:.0%} of {one.pairs} | {one.p_value:.2g} |"
         )
     return lines

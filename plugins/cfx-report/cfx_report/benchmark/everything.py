@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from typing import cast
 
+import cfx
 from cfx.errors import ConfigError
 from cfx.plugin import registry
 from cfx_report.benchmark.rival import Rival
@@ -32,7 +33,7 @@ def commands(options: argparse.Namespace) -> Iterator[list[str]]:
         yield [f"model={model}", *where]
     trained = []
     for entry in registry.entries("rival"):
-        rival = cast("type[Rival]", registry.get("rival", entry.name))
+        rival = cast("type[Rival]", cfx.get("rival", entry.name))
         if rival.trains:
             trained.append([f"rival={entry.name}"])
         else:
