@@ -58,7 +58,9 @@ def description_of(
     units = ET.SubElement(root, "UnitDefinitions")
     for name, powers in _BASE_UNITS.items():
         unit = ET.SubElement(units, "Unit", name=name)
-        ET.SubElement(unit, "BaseUnit", {base: str(power) for base, power in powers.items()})
+        base = ET.SubElement(unit, "BaseUnit")
+        for name_of_base, power in powers.items():
+            base.set(name_of_base, str(power))
     categories = ET.SubElement(root, "LogCategories")
     for category in ("logStatusError", "logStatusDiscard"):
         ET.SubElement(categories, "Category", name=category)
@@ -108,9 +110,7 @@ def _variable(
     **attributes: str,
 ) -> None:
     unit, meaning = signal
-    if unit in _BASE_UNITS:
-        attributes["unit"] = unit
-    ET.SubElement(
+    variable = ET.SubElement(
         variables,
         "Float64",
         name=name,
@@ -118,5 +118,8 @@ def _variable(
         causality=causality,
         variability="continuous",
         description=meaning,
-        **attributes,
     )
+    if unit in _BASE_UNITS:
+        attributes["unit"] = unit
+    for attribute, value in attributes.items():
+        variable.set(attribute, value)
