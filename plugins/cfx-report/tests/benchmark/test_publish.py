@@ -39,6 +39,8 @@ def test_a_finished_job_is_published_without_training(
     ]
     (job / "metrics.json").write_text(json.dumps(metrics))
     (job / "data.json").write_text(json.dumps({"fingerprint": "abc"}))
+    learner = "learner:\n  simulated_drivers: 80\n  simulated_queues: 0\n"
+    (job / "config.yaml").write_text(learner)
     monkeypatch.setattr(publish, "READY_FOLDER", folder)
     stress = card_of(name)["stress"]
     monkeypatch.setattr(publish, "_stress", lambda _: stress)
@@ -49,7 +51,9 @@ def test_a_finished_job_is_published_without_training(
     expected = card_of(name)
     for key in ("model", "errors_on_unseen_drivers", "safety", "valid_range", "command"):
         assert card[key] == expected[key]
-    assert (folder / name / "CARD.md").read_text() == card_text(card, measured)
+    text = (folder / name / "CARD.md").read_text()
+    assert text == card_text(card, measured)
+    assert "too: 80 in stop-and-go traffic (Krauss's model and IDM)\n" in text
     assert traffic_of(name) == json.loads((folder / name / "traffic.json").read_text())
 
 
