@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.cache import Arrays
-from cfx.calibration.losses import FullTrajectories, PooledLosses, Prior, SegmentLosses
+from cfx.calibration.losses import PooledLosses, Prior, SegmentLosses, TrajectorySegments
 from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import Optimizer, Solution
 from cfx.calibration.rmse import SpeedRmse
@@ -24,7 +24,7 @@ from cfx.core.component import content_key, folder_hash
 from cfx.core.engine import Report, Unfit
 from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
-from cfx.errors import EngineError, PluginError
+from cfx.errors import ConfigError, EngineError, PluginError
 from cfx.simulation.base import Stepper
 
 _SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
@@ -51,6 +51,8 @@ class Solver:
         prior: weight of the prior on driver-specific and pooled parameters
             (`cfx.calibration.losses`); 0: none. Labels have none: ties go to the driver's own set.
         chooses_prior: that of driver-specific ones is chosen (`cfx.calibration.strength`).
+        pooled_segment_s: length of the segments that pooled parameters are calibrated on, s; None:
+            whole trajectories.
     """
 
     stepper: Stepper
@@ -60,11 +62,30 @@ class Solver:
     memory: int = 1 << 30
     prior: float = 0.0
     chooses_prior: bool = False
+    pooled_segment_s: float | None = None
 
     @property
     def space(self) -> ParameterSpace:
         """The model's parameter space."""
         return self.stepper.model.space
+
+    @property
+    def steps_of_segment(self) -> int | None:
+        """Steps of the segments that pooled parameters are calibrated on; None: all.
+
+        Raises:
+            ConfigError: they are shorter than a time step.
+        """
+        if self.pooled_segment_s is None:
+            return None
+        steps = round(self.pooled_segment_s / self.stepper.dt)
+        if steps < 1:
+            raise ConfigError(
+                f"calibration.pooled_segment_s={self.pooled_segment_s:g}: shorter than the time"
+                f" step of {self.stepper.dt:g} s; set at least {self.stepper.dt:g}, or null for"
+                " whole trajectories"
+            )
+        return steps
 
     def segments(
         self, batch: PairBatch, pair: Tensor, first: Tensor, steps: Tensor
@@ -287,8 +308,11 @@ class PooledShard(CalibrationShard):
 
     def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
         stepper, objective = self.solver.stepper, self.solver.objective
-        trajectories = FullTrajectories(stepper, objective, self.batch, self.last)
-        return PooledLosses(trajectories, self.members, self.solver.memory), None, 0.0
+        length = self.solver.steps_of_segment
+        segments = TrajectorySegments.of_pairs(stepper, objective, self.batch, self.last, length)
+        members = self.members[:, segments.pair]
+        losses = PooledLosses(segments, members, self.solver.memory, segments.weight)
+        return losses, None, 0.0
 
 
 def _towards(default: Tensor, losses: SegmentLosses | PooledLosses, best: Tensor) -> Tensor:
