@@ -353,17 +353,17 @@ class Calibrator:
             group = _group_key(pairs, last, row)
             keys.append(self._key("pooled", "", pairs=group, **details))
 
-        compiled, brief = self._has_kernel(batch), self.solver.brief
-        code = content_key(brief.scope)
+        compiled, solver = self._has_kernel(batch), self.solver.of_pooled
+        code = content_key(solver.scope)
 
         def shard(chosen: Tensor, _claim: Tensor) -> PooledShard:
             groups = members[chosen].to(device)
             used = groups.any(0).nonzero()[:, 0]
             trajectories = batch[used].trimmed()
-            return PooledShard(brief, code, compiled, trajectories, last[used], groups[:, used])
+            return PooledShard(solver, code, compiled, trajectories, last[used], groups[:, used])
 
         # One shard: groups have candidates in common, and what is simulated for one serves all.
-        results = self._cached("Pooled parameters", keys, [1] * len(members), shard, solver=brief)
+        results = self._cached("Pooled parameters", keys, [1] * len(members), shard, solver=solver)
         return _stacked(results, requested_device)
 
     def labels(

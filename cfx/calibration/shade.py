@@ -84,6 +84,12 @@ class ShadeSettings(Settings):
         description="evaluations of each window's label and of pooled parameters, by the gradient"
         " search; no more than samples",
     )
+    pooled_samples: int | None = Field(
+        None,
+        ge=1,
+        description="most evaluations of pooled parameters where populations search them too, such"
+        " as 20000; null: the gradient search with brief_samples",
+    )
 
 
 class ShadeSearch(Optimizer):
@@ -140,6 +146,11 @@ class ShadeSearch(Optimizer):
         if self.settings.samples is not None:
             samples = min(samples, self.settings.samples)
         return GradientSearch(samples=samples)
+
+    def of_pooled(self) -> Optimizer:
+        if self.settings.pooled_samples is None:
+            return self.brief()
+        return ShadeSearch(samples=self.settings.pooled_samples)
 
     def bytes_per_problem(self, n: int) -> int:
         if self._plan(n) is None:

@@ -100,8 +100,13 @@ class Solver:
 
     @property
     def brief(self) -> Solver:
-        """The solver of labels and pooled parameters: `Optimizer.brief`."""
+        """The solver of labels: `Optimizer.brief`."""
         return replace(self, optimizer=self.optimizer.brief())
+
+    @property
+    def of_pooled(self) -> Solver:
+        """The solver of pooled parameters: `Optimizer.of_pooled`."""
+        return replace(self, optimizer=self.optimizer.of_pooled())
 
     @property
     def scope(self) -> dict[str, Any]:

@@ -109,7 +109,7 @@ def pooled(
     weight = segments.weight * task.weight[segments.pair]
     losses = PooledLosses(segments, ~task.tested[segments.pair][None], _MEMORY, weight)
     optimizer = cast("Optimizer", registry.create("optimizer", {"name": "shade"}))
-    solver = Solver(stepper, optimizer, 0, objective=objective, prior=_WEAK).brief
+    solver = Solver(stepper, optimizer, 0, objective=objective, prior=_WEAK).of_pooled
     row = solver.minimize(losses, lambda _: None)
     return solver.space.to_unit(torch.as_tensor(row["parameters"])).double()
 
