@@ -22,6 +22,7 @@ from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import CandidateLosses, Optimizer
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.rmse import GapRmse, SpeedRmse
+from cfx.calibration.shade import ShadeSearch
 from cfx.calibration.shards import CalibrationShard, Solver
 from cfx.calibration.theil_u import TheilInequality
 from cfx.core import threads
@@ -65,7 +66,7 @@ class Counting(RandomSearch):
 
 
 def calibrator(
-    optimizer: RandomSearch,
+    optimizer: Optimizer,
     folder: Path | None = None,
     model: DrivingModel | None = None,
     **changes: Any,
@@ -106,6 +107,15 @@ def test_constant_true_parameters_are_recovered(
         zip(model.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True)
     )
     assert all(error[name] < limit for name, limit in tolerance.items()), error
+
+
+def test_ends_are_not_apart_where_drivers_are_followed_exactly() -> None:
+    pairs, last = wavy_pairs(Krauss(), TRUE, frames=400), torch.full((3,), 390)
+    tool = calibrator(ShadeSearch())
+    batch = PairBatch.of(pairs)
+    found = tool.driver_specific(pairs, batch, last)
+    assert float((found[:, 0] - TRUE[:, 0]).abs().max()) < 1e-3
+    assert max(tool.apart(pairs, last)) < 0.01
 
 
 def test_pooled_parameters_are_those_of_segments_of_the_length_that_is_asked(
