@@ -205,34 +205,40 @@ class Calibrator:
         return found
 
     def searched(
-        self, pairs: PairSet, batch: PairBatch, last: Tensor
+        self, pairs: PairSet, batch: PairBatch, last: Tensor, first: Tensor | None = None
     ) -> tuple[Tensor, list[float]]:
         """Returns each pair's parameters with the solver's prior, and how far its ends were apart.
 
         Args:
             pairs, batch, last: as in `driver_specific`.
+            first: `(P,)`, the frame that each is simulated from; None: frame 0.
         """
         requested_device, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         last = last.to(device)
+        start = torch.zeros_like(last)
+        if first is not None:
+            start = first.to(device)
         keys = []
-        for pair, end in zip(pairs, last.tolist(), strict=True):
+        for pair, begin, end in zip(pairs, start.tolist(), last.tolist(), strict=True):
+            frames = [begin, end]
             keys.append(
-                self._key("driver_specific", pair.fingerprint, frames=end, **self._prior_key)
+                self._key("driver_specific", pair.fingerprint, frames=frames, **self._prior_key)
             )
         compiled = self._has_kernel(batch)
 
         def shard(chosen: Tensor, claim: Tensor) -> SegmentShard:
             chosen = chosen.to(device)
-            solver = self._solver_for(len(claim) * int(last[claim].max()))
+            steps = last - start
+            solver = self._solver_for(len(claim) * int(steps[claim].max()))
             return SegmentShard(
                 solver,
                 self._code,
                 compiled,
                 batch[chosen].trimmed(),
                 pair=torch.arange(len(chosen), device=device),
-                first=torch.zeros_like(last[chosen]),
-                steps=last[chosen],
+                first=start[chosen],
+                steps=steps[chosen],
             )
 
         title = "Driver-specific parameters"
@@ -244,8 +250,9 @@ class Calibrator:
     def prior_strength(self, pairs: PairSet, batch: PairBatch, last: Tensor) -> PriorStrength:
         """Tries how strong a prior serves driver-specific parameters best.
 
-        They are calibrated on the first two thirds of what may be used, and drive the rest from the
-        measured state there; nothing after `last` is read.
+        They are calibrated on the first two thirds of what may be used and drive the last one, then
+        on the last two and drive the first, each from a measured state; nothing after `last` is
+        read.
 
         Args:
             pairs, batch, last: as in `driver_specific`.
@@ -256,15 +263,24 @@ class Calibrator:
         which[chosen] = True
         some = pairs.select(which.tolist(), "not tried")
         tried, end = batch[chosen.to(batch.lengths.device)], last.cpu()[chosen]
-        cut = (FITTED * end).long().clamp(min=1)
+        later = (FITTED * end).long().clamp(min=1)
+        earlier = end - later
         by_weight = []
         for weight in WEIGHTS:
-            own, _ = self._with_prior(weight, _silent).searched(some, tried, cut)
-            by_weight.append(self._held_out_losses(tried, cut, end, own))
+            calibrator = self._with_prior(weight, _silent)
+            of_first, _ = calibrator.searched(some, tried, later)
+            of_last, _ = calibrator.searched(some, tried, end, earlier)
+            begin = torch.zeros_like(end)
+            held_out = [
+                self._held_out_losses(tried, later, end, of_first),
+                self._held_out_losses(tried, begin, earlier, of_last),
+            ]
+            by_weight.append(torch.stack(held_out))
         losses = torch.stack(by_weight)
-        is_known = losses.isfinite().all(0)  # the same drivers count for each weight
+        # (weights, thirds, drivers): the same drivers count for each weight.
+        is_known = losses.isfinite().all(0).all(0)
         least = max(_LEAST_LOSS * self.solver.objective.floor, _LEAST_LOSS)
-        means = losses[:, is_known].clamp(min=least).log().mean(1).exp()
+        means = losses[:, :, is_known].clamp(min=least).log().mean((1, 2)).exp()
         strength = PriorStrength(
             dict(zip(WEIGHTS, means.tolist(), strict=True)), int(is_known.sum())
         )
@@ -311,7 +327,8 @@ class Calibrator:
     def pooled(self, pairs: PairSet, batch: PairBatch, last: Tensor, members: Tensor) -> Tensor:
         """Finds one parameter set for each of K groups of pairs: the pooled parameters.
 
-        Their loss is the mean of their pairs' losses: see `PooledLosses`.
+        Their loss is the mean of their pairs' losses (`PooledLosses`), of whole trajectories or of
+        segments (`Solver.pooled_segment_s`).
 
         Args:
             pairs: P pairs.
@@ -321,26 +338,32 @@ class Calibrator:
 
         Returns:
             `(K, n)`, SI units.
+
+        Raises:
+            ConfigError: segments are shorter than a time step.
         """
         requested_device, batch = batch.lengths.device, self._where_it_is_fast(batch)
         device = batch.lengths.device
         members, last = members.cpu(), last.to(device)
+        details: dict[str, Any] = dict(self._prior_key)
+        if self.solver.steps_of_segment is not None:
+            details["segment"] = self.solver.steps_of_segment
         keys = []
         for row in members:
             group = _group_key(pairs, last, row)
-            keys.append(self._key("pooled", "", pairs=group, **self._prior_key))
+            keys.append(self._key("pooled", "", pairs=group, **details))
 
-        compiled, brief = self._has_kernel(batch), self.solver.brief
-        code = content_key(brief.scope)
+        compiled, solver = self._has_kernel(batch), self.solver.of_pooled
+        code = content_key(solver.scope)
 
         def shard(chosen: Tensor, _claim: Tensor) -> PooledShard:
             groups = members[chosen].to(device)
             used = groups.any(0).nonzero()[:, 0]
             trajectories = batch[used].trimmed()
-            return PooledShard(brief, code, compiled, trajectories, last[used], groups[:, used])
+            return PooledShard(solver, code, compiled, trajectories, last[used], groups[:, used])
 
         # One shard: groups have candidates in common, and what is simulated for one serves all.
-        results = self._cached("Pooled parameters", keys, [1] * len(members), shard, solver=brief)
+        results = self._cached("Pooled parameters", keys, [1] * len(members), shard, solver=solver)
         return _stacked(results, requested_device)
 
     def labels(

@@ -285,41 +285,83 @@ class SegmentLosses:
 
 
 @dataclass(frozen=True)
-class FullTrajectories:
-    """Pairs from frame 0 to a last one, as segments that are cut out where they are simulated.
+class TrajectorySegments:
+    """Segments of pairs, which are cut out where they are simulated.
+
+    Each starts from a measured state, and the next one of the pair where it ends.
 
     Attributes:
         stepper: the model and its time step.
-        objective: compares the simulated trajectories with the measured ones.
+        objective: compares the simulated segments with the measured ones.
         batch: P pairs.
-        last: `(P,)`, the last frame that is compared.
+        pair: `(D,)`, index of each segment's pair in the batch.
+        first: `(D,)`, frame at which the segment starts.
+        last: `(D,)`, the last frame that is compared.
+        weight: `(D,)`, 1 over the number of the pair's segments: every pair counts alike.
     """
 
     stepper: Stepper
     objective: Objective
     batch: PairBatch
+    pair: Tensor
+    first: Tensor
     last: Tensor
+    weight: Tensor
+
+    @classmethod
+    def of_pairs(
+        cls,
+        stepper: Stepper,
+        objective: Objective,
+        batch: PairBatch,
+        last: Tensor,
+        length: int | None = None,
+    ) -> TrajectorySegments:
+        """Cuts pairs, from frame 0 to their last one.
+
+        Args:
+            stepper: the model and its time step.
+            objective: compares the simulated segments with the measured ones.
+            batch: P pairs.
+            last: `(P,)`, the last frame that is compared.
+            length: steps of each segment. A pair that is no multiple of it is cut into as many as
+                come nearest, of about the same length, so that no remainder is left out or
+                compared after less time than the others. None: pairs stay whole.
+        """
+        pieces = torch.ones_like(last)
+        if length is not None:
+            pieces = (last / length).round().long().clamp(min=1)
+        pair = torch.arange(len(last), device=last.device).repeat_interleave(pieces)
+        number = torch.arange(len(pair), device=last.device) - (pieces.cumsum(0) - pieces)[pair]
+        first = number * last[pair] // pieces[pair]
+        end = (number + 1) * last[pair] // pieces[pair]
+        weight = 1.0 / pieces[pair].double()
+        return cls(stepper, objective, batch, pair, first, end, weight)
 
     @property
     def problems(self) -> int:
-        """P."""
-        return len(self.last)
+        """D."""
+        return len(self.pair)
 
     @property
     def device(self) -> torch.device:
         """The device of the tensors."""
-        return self.last.device
+        return self.pair.device
 
     @property
     def steps(self) -> int:
-        """K, of the longest."""
-        return int(self.last.max())
+        """K, of the longest segment."""
+        return int((self.last - self.first).max())
 
     def take(self, problems: Tensor) -> SegmentLosses:
-        """Returns pairs of numbers `(S,)` int64; one may stand there more than once."""
-        first, last = torch.zeros_like(problems), self.last[problems]
+        """Returns segments of numbers `(S,)` int64; one may stand there more than once."""
         return SegmentLosses.of_segments(
-            self.stepper, self.objective, self.batch, problems, first, last
+            self.stepper,
+            self.objective,
+            self.batch,
+            self.pair[problems],
+            self.first[problems],
+            (self.last - self.first)[problems],
         )
 
 
@@ -343,22 +385,24 @@ _VECTOR = 32
 class PooledLosses:
     """The mean loss over many segments, for one parameter set that is shared by all of them.
 
-    The mean of losses, not the loss over all frames: every driver counts alike, and the mean is
-    what an evaluation reports. A segment that belongs to several problems is simulated once, for
-    the candidates of all of them, or once for all where these are the same, as space-filling ones
-    are.
+    The mean of losses, not the loss over all frames: every driver counts alike, and the mean over
+    whole trajectories is what an evaluation reports. A segment that belongs to several problems is
+    simulated once, for the candidates of all of them, or once for all where these are the same, as
+    space-filling ones are.
 
     Attributes:
         segments: D segments.
         members: the segments of each of K problems, bool `(K, D)`.
         memory: bound in bytes for what is simulated at once; candidates are simulated in shards
             where all segments of all of them need more.
+        weight: how much each segment counts, `(D,)`; None: all alike.
         prior: added to the losses; None: none.
     """
 
-    segments: SegmentLosses | FullTrajectories
+    segments: SegmentLosses | TrajectorySegments
     members: Tensor
     memory: int
+    weight: Tensor | None = None
     prior: Prior | None = None
 
     @property
@@ -415,14 +459,17 @@ class PooledLosses:
                 self._add_shared(segments, numbers, total, candidates[:1])
             else:
                 self._add(segments, numbers, total, candidates)
-        losses = total / self.members.sum(1, keepdim=True)
+        counts = self.members
+        if self.weight is not None:
+            counts = counts * self.weight
+        losses = total / counts.sum(1, keepdim=True)
         if self.prior is None:
             return losses
         return losses + self.prior.penalty(candidates)
 
     def _add_shared(
         self,
-        segments: SegmentLosses | FullTrajectories,
+        segments: SegmentLosses | TrajectorySegments,
         numbers: Tensor,
         total: Tensor,
         candidates: Tensor,
@@ -439,11 +486,11 @@ class PooledLosses:
         losses_of = segments.take(numbers)
         for columns, shard in self._shards(losses_of, len(numbers), total, candidates):
             losses = losses_of(shard.expand(len(numbers), -1, -1)).to(total)
-            columns.index_add_(0, problem, losses[place])
+            columns.index_add_(0, problem, self._weighted(losses[place], numbers[place]))
 
     def _add(
         self,
-        segments: SegmentLosses | FullTrajectories,
+        segments: SegmentLosses | TrajectorySegments,
         numbers: Tensor,
         total: Tensor,
         candidates: Tensor,
@@ -460,7 +507,13 @@ class PooledLosses:
                 # (G, m, q, n) -> (G, m q, n): a segment is simulated once for all its problems.
                 of_group = losses_of_group(shard[group.problems].flatten(1, 2)).to(total)
                 losses[group.members] = of_group.reshape(*group.problems.shape, width)
-            columns.index_add_(0, problem, losses)
+            columns.index_add_(0, problem, self._weighted(losses, numbers[place]))
+
+    def _weighted(self, losses: Tensor, segments: Tensor) -> Tensor:
+        """Returns losses `(S, q)` of segments of numbers `(S,)` as much as they count."""
+        if self.weight is None:
+            return losses
+        return losses * self.weight[segments, None]
 
     def _shards(
         self, segments: SegmentLosses, simulated: int, total: Tensor, candidates: Tensor

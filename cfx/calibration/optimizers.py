@@ -205,12 +205,18 @@ class Optimizer(Component):
         return 0
 
     def brief(self) -> Optimizer:
-        """Returns the optimizer of labels and pooled parameters; itself by default.
+        """Returns the optimizer of labels; itself by default.
 
-        There are hundreds of windows for each driver, and one evaluation of pooled parameters
-        simulates all drivers.
+        There are hundreds of windows for each driver.
         """
         return self
+
+    def of_pooled(self) -> Optimizer:
+        """Returns the optimizer of pooled parameters; that of labels by default.
+
+        One of their evaluations simulates all drivers.
+        """
+        return self.brief()
 
     def minimize(
         self,

@@ -49,8 +49,15 @@ class CalibrationSettings(Settings):
         "chosen",
         description="weak: parameters that a recording does not determine stay near the model's"
         " default; chosen: driver-specific ones have the strength of the prior that errs least on"
-        " the last third of what is calibrated on, for all drivers together; none: as in the"
-        " paper",
+        " thirds of what is calibrated on that are left out, for all drivers together; none: as in"
+        " the paper",
+    )
+    pooled_segment_s: float | None = Field(
+        None,
+        gt=0,
+        description="s: pooled parameters are calibrated on pieces of about this length, each"
+        " simulated from a measured state; every pair counts alike. null: on whole trajectories,"
+        " as they are tested",
     )
     posterior: str = Field(
         "none",

@@ -39,6 +39,14 @@ Gipps's and Wiedemann's losses, and large ones get to their bottom."""
 _LONG_SIZE, _MERGED_SIZE = 32, 64
 """Candidates of each population of the long search, and of merged ones. A kernel takes 32."""
 
+_LOW_POWER = 3
+"""Every second population begins with points whose coordinates are raised to this power. Bounds are
+wide, and what a driver does is often near the low end: a desired speed of 8 m/s between 1 and 70, a
+deceleration of 0.4 m/s2 between 0.1 and 6. There even points are rare, and four populations that
+begin with the same distribution agree on the same wrong minimum. The gap's excess over the best
+known with SUMO's IDM, mean of 25 drivers and three seeds: 1.8 % without, 1.7 % with squares, 0.2 %
+with the third power."""
+
 _OF_FIRST, _OF_LONG = 300, 1400
 """Evaluations of one of the first populations, for each parameter, and of the long search, for each
 pair of parameters, n^2. Measured by `python -m tests.benchmarks.optimum`."""
@@ -76,12 +84,19 @@ class ShadeSettings(Settings):
         description="evaluations of each window's label and of pooled parameters, by the gradient"
         " search; no more than samples",
     )
+    pooled_samples: int | None = Field(
+        None,
+        ge=1,
+        description="most evaluations of pooled parameters where populations search them too, such"
+        " as 20000; null: the gradient search with brief_samples",
+    )
 
 
 class ShadeSearch(Optimizer):
     """Differential evolution whose steps adapt to what succeeded (SHADE), and a gradient search.
 
-    Four small populations search each problem, and a gradient search goes on from the best of each.
+    Four small populations search each problem, two of them from points that are denser near the low
+    ends of the bounds, and a gradient search goes on from the best of each.
     Where three end at the same loss, that is the optimum. Else eight others search at length, are
     merged by twos into four and two, and what these two come to is compared. All populations of
     all problems are one batch.
@@ -132,6 +147,11 @@ class ShadeSearch(Optimizer):
             samples = min(samples, self.settings.samples)
         return GradientSearch(samples=samples)
 
+    def of_pooled(self) -> Optimizer:
+        if self.settings.pooled_samples is None:
+            return self.brief()
+        return ShadeSearch(samples=self.settings.pooled_samples)
+
     def bytes_per_problem(self, n: int) -> int:
         if self._plan(n) is None:
             return self._gradient(n).bytes_per_problem(n)
@@ -149,6 +169,7 @@ class ShadeSearch(Optimizer):
         points = sobol(
             plan.first_points - g + plan.long_points, n, seed=seed, device=guesses.device
         )
+        points = _denser_at_low_ends(points, g)
         filling = points[: plan.first_points - g].expand(problems, -1, -1)
         first = torch.cat([guesses, filling], dim=1)
         losses = objective(first)
@@ -274,6 +295,17 @@ def _size(stage: int) -> int:
 def _finish_evaluations(n: int, size: int) -> int:
     """Returns the evaluations that `_finished` takes for one population."""
     return size + 1 + _ROUNDS * evaluations_of_round(n)
+
+
+def _denser_at_low_ends(points: Tensor, place: int) -> Tensor:
+    """Returns points `(q, n)`, of which those of every second population are nearer to 0.
+
+    Args:
+        points: in unit space.
+        place: of the first one where points are dealt out to populations, see `_begin`.
+    """
+    number = torch.arange(place, place + len(points), device=points.device)
+    return torch.where((number % 2 == 1)[:, None], points**_LOW_POWER, points)
 
 
 class _Draws:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from cfx.calibration.cache import Arrays
-from cfx.calibration.losses import FullTrajectories, PooledLosses, Prior, SegmentLosses
+from cfx.calibration.losses import PooledLosses, Prior, SegmentLosses, TrajectorySegments
 from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import Optimizer, Solution
 from cfx.calibration.rmse import SpeedRmse
@@ -24,7 +24,7 @@ from cfx.core.component import content_key, folder_hash
 from cfx.core.engine import Report, Unfit
 from cfx.core.parameters import ParameterSpace, squashed
 from cfx.data.pairs import PairBatch
-from cfx.errors import EngineError, PluginError
+from cfx.errors import ConfigError, EngineError, PluginError
 from cfx.simulation.base import Stepper
 
 _SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
@@ -33,6 +33,11 @@ _SAME_RELATIVE, _SAME_ABSOLUTE = 1e-5, 1e-8
 _STEPS_TOWARDS_DEFAULT = (1.0, 0.9, 0.7, 0.5, 0.3, 0.1, 0.03, 0.01, 0.0)
 """Line search along one parameter, from the search's end point to the model's default: 1 is the
 default, 0 the end point. All are evaluated in one batch; the lowest loss plus prior wins."""
+
+_LEAST_FLOOR = 0.05
+"""Share of an objective's floor that a smaller loss counts as where ends of a search are compared:
+0.01 m/s. Simulated drivers are followed within 1e-6 m/s, of which ends differ by half or by
+fifty times, and no optimum is missed."""
 
 _LINE_SEARCHES = 6
 """Most line searches along each parameter (coordinate descent; it ends when none moves)."""
@@ -51,6 +56,8 @@ class Solver:
         prior: weight of the prior on driver-specific and pooled parameters
             (`cfx.calibration.losses`); 0: none. Labels have none: ties go to the driver's own set.
         chooses_prior: that of driver-specific ones is chosen (`cfx.calibration.strength`).
+        pooled_segment_s: length of the segments that pooled parameters are calibrated on, s; None:
+            whole trajectories.
     """
 
     stepper: Stepper
@@ -60,11 +67,30 @@ class Solver:
     memory: int = 1 << 30
     prior: float = 0.0
     chooses_prior: bool = False
+    pooled_segment_s: float | None = None
 
     @property
     def space(self) -> ParameterSpace:
         """The model's parameter space."""
         return self.stepper.model.space
+
+    @property
+    def steps_of_segment(self) -> int | None:
+        """Steps of the segments that pooled parameters are calibrated on; None: all.
+
+        Raises:
+            ConfigError: they are shorter than a time step.
+        """
+        if self.pooled_segment_s is None:
+            return None
+        steps = round(self.pooled_segment_s / self.stepper.dt)
+        if steps < 1:
+            raise ConfigError(
+                f"calibration.pooled_segment_s={self.pooled_segment_s:g}: shorter than the time"
+                f" step of {self.stepper.dt:g} s; set at least {self.stepper.dt:g}, or null for"
+                " whole trajectories"
+            )
+        return steps
 
     def segments(
         self, batch: PairBatch, pair: Tensor, first: Tensor, steps: Tensor
@@ -79,8 +105,13 @@ class Solver:
 
     @property
     def brief(self) -> Solver:
-        """The solver of labels and pooled parameters: `Optimizer.brief`."""
+        """The solver of labels: `Optimizer.brief`."""
         return replace(self, optimizer=self.optimizer.brief())
+
+    @property
+    def of_pooled(self) -> Solver:
+        """The solver of pooled parameters: `Optimizer.of_pooled`."""
+        return replace(self, optimizer=self.optimizer.of_pooled())
 
     @property
     def scope(self) -> dict[str, Any]:
@@ -146,7 +177,9 @@ class Solver:
             "diverged": solution.diverged.cpu().numpy(),
         }
         if self.optimizer.ends(len(self.space)):
-            row["apart"] = solution.apart.cpu().numpy()
+            least = max(_LEAST_FLOOR * self.objective.floor, _SAME_ABSOLUTE)
+            share_of_least = (solution.loss / least).clamp(max=1.0)
+            row["apart"] = (solution.apart * share_of_least).cpu().numpy()
         return row
 
     def _settled(
@@ -287,8 +320,11 @@ class PooledShard(CalibrationShard):
 
     def problem(self) -> tuple[SegmentLosses | PooledLosses, Tensor | None, float]:
         stepper, objective = self.solver.stepper, self.solver.objective
-        trajectories = FullTrajectories(stepper, objective, self.batch, self.last)
-        return PooledLosses(trajectories, self.members, self.solver.memory), None, 0.0
+        length = self.solver.steps_of_segment
+        segments = TrajectorySegments.of_pairs(stepper, objective, self.batch, self.last, length)
+        members = self.members[:, segments.pair]
+        losses = PooledLosses(segments, members, self.solver.memory, segments.weight)
+        return losses, None, 0.0
 
 
 def _towards(default: Tensor, losses: SegmentLosses | PooledLosses, best: Tensor) -> Tensor:

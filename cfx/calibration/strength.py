@@ -22,7 +22,10 @@ WEIGHTS = (0.01, 0.03, 0.1, 0.3, 1.0)
 space away from its default costs as much as the default's loss over n."""
 
 FITTED = 2 / 3
-"""Share of the part that may be used that is calibrated on; the rest is held out."""
+"""Share of the part that may be used that is calibrated on; the rest is held out, once the last
+third and once the first. One third alone says what its own traffic asks for: for IDM and 24
+drivers of I-80 the last one chooses a weight of 0.67 and both choose 0.35, with errors of 0.734 and
+0.707 m/s on the last fifth, which neither has seen."""
 
 MOST = 32
 """Pairs that are tried at most, those evenly spread over all: so a large recording costs little
@@ -71,13 +74,14 @@ class PriorStrength:
         if not self.pairs:
             return (
                 f"The prior of driver-specific parameters has the weight {self.weight:g}: no pair"
-                " can be driven on the last third of what is calibrated on"
+                " can be driven on the first and the last third of what is calibrated on"
             )
         tried = [f"{weight:g}: {error:.3f}" for weight, error in self.errors.items()]
         shown = f"{listed(tried, len(tried))} {unit}".rstrip()
         return (
             f"The prior of driver-specific parameters has the weight {self.weight:.2g}: errors of"
-            f" {self.pairs} pairs on the last third of what is calibrated on, by weight: {shown}"
+            f" {self.pairs} pairs on the first and the last third of what is calibrated on, each"
+            f" left out in turn, by weight: {shown}"
             " (calibration.prior=none: without)"
         )
 

@@ -1,7 +1,8 @@
 """The loops that a student would write: one driver, one candidate, one step after the other.
 
 Equations by hand, the loss accumulated on the fly, compiled by numba, one thread. They are what
-`test_calibration_benchmark.py` measures the compiled models against; nothing else uses them.
+`test_calibration_benchmark.py` measures the compiled models against, and what `optimum.py` checks
+their losses and optima with; nothing else uses them.
 """
 
 from __future__ import annotations
@@ -34,6 +35,16 @@ def _idm(v: float, gap: float, v_l: float, a_l: float, a: float, dt: float, p: A
     wanted = s0 + max(0.0, v * headway + v * (v - v_l) / (2.0 * math.sqrt(accel * b)))
     crowding = wanted / max(gap, 0.1)
     return max(v + accel * (1.0 - (v / v0) ** delta - crowding * crowding) * dt, 0.0)
+
+
+@_jit
+def _gipps(v: float, gap: float, v_l: float, a_l: float, a: float, dt: float, p: Any) -> float:
+    tau, desired, accel, b, b_hat, s0 = p
+    ratio = v / desired
+    free = v + 2.5 * accel * tau * (1.0 - ratio) * math.sqrt(0.025 + ratio)
+    room = 2.0 * (gap - s0) - v * tau + v_l * v_l / b_hat
+    safe = math.sqrt(max(b * b * tau * tau + b * room, 0.0)) - b * tau
+    return max(v + (min(free, safe) - v) * min(dt / tau, 1.0), 0.0)
 
 
 @_jit
@@ -127,4 +138,9 @@ def loop_of(step: Any) -> Any:
     return loop
 
 
-LOOPS = {"krauss": loop_of(_krauss), "idm": loop_of(_idm), "w99": loop_of(_w99)}
+LOOPS = {
+    "krauss": loop_of(_krauss),
+    "idm": loop_of(_idm),
+    "gipps": loop_of(_gipps),
+    "w99": loop_of(_w99),
+}

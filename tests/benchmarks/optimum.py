@@ -5,6 +5,10 @@ trajectories of 20 I-80 and 5 OpenACC drivers in `../shared/data`, without a pri
 reference is the better of two runs of `scipy.optimize.differential_evolution` for each driver, of
 up to 1,200 generations; it takes minutes for Wiedemann's models and is kept in a file.
 
+With `--plain` (IDM, Gipps, Wiedemann 99; errors of speed) the losses of the reference come from the
+loops of `numba_loops`, which share no code with cfx, and `--drivers 5` takes the first drivers of
+I-80 alone.
+
 Of each optimizer: the mean excess over the reference in percent (the median, lowest and highest);
 for how many drivers it is above 0.1 %; for how many independent ends differ by more than 1 %; CPU
 seconds for each driver.
@@ -15,7 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, cast
 
@@ -61,14 +65,51 @@ def losses_of(model: str, objective: str, batch: PairBatch) -> SegmentLosses:
     )
 
 
-def reference(losses: SegmentLosses) -> list[float]:
-    """Returns the lowest loss that SciPy's differential evolution finds for each driver."""
+def plain(losses: SegmentLosses, model: str) -> Callable[[Tensor], Tensor]:
+    """Returns the errors of speed of one driver's candidates `(1, q, n)`, by a loop in numba."""
+    from tests.benchmarks import numba_loops
+
+    segments, space = losses.segments, losses.stepper.model.space
+    frames = [segments.leader_position, segments.leader_speed, segments.leader_acceleration]
+    arrays = [np.ascontiguousarray(one.numpy().T) for one in frames]
+    for value in (
+        segments.leader_length,
+        segments.position,
+        segments.speed,
+        segments.acceleration,
+    ):
+        arrays.append(value.numpy())
+    arrays.append(np.ascontiguousarray(segments.measured_speed.numpy().T))
+    steps = segments.counted.sum(0).long().numpy()
+    loop = numba_loops.LOOPS[model]
+
+    def errors(unit: Tensor) -> Tensor:
+        columns = []
+        for value in space.unpack(space.from_unit(unit[0])).values():
+            columns.append(value.expand(unit.shape[1]).numpy())
+        candidates = np.ascontiguousarray(np.stack(columns, axis=1))
+        return torch.from_numpy(loop(*arrays, steps, candidates, losses.stepper.dt))
+
+    return errors
+
+
+def reference(losses: SegmentLosses, model: str | None = None) -> list[float]:
+    """Returns the lowest loss that SciPy's differential evolution finds for each driver.
+
+    Args:
+        losses: of cfx.
+        model: its name, where the loop of `plain` takes the place of cfx's losses.
+    """
     n = len(losses.stepper.model.space)
     lowest = []
     for number in range(losses.problems):
-        of_driver = losses.take(slice(number, number + 1))
+        of_driver: Callable[[Tensor], Tensor] = losses.take(slice(number, number + 1))
+        if model is not None:
+            of_driver = plain(losses.take(slice(number, number + 1)), model)
 
-        def loss(candidates: NDArray[np.float64], of_driver: SegmentLosses = of_driver) -> Any:
+        def loss(
+            candidates: NDArray[np.float64], of_driver: Callable[[Tensor], Tensor] = of_driver
+        ) -> Any:
             unit = torch.from_numpy(np.ascontiguousarray(candidates.T))[None]
             return np.nan_to_num(of_driver(unit)[0].numpy(), nan=1e100, posinf=1e100)
 
@@ -132,6 +173,8 @@ def main() -> None:
     parser.add_argument("models", nargs="+")
     parser.add_argument("--optimizers", nargs="*", default=["gradient", "shade"])
     parser.add_argument("--seeds", type=int, default=1)
+    parser.add_argument("--plain", action="store_true")
+    parser.add_argument("--drivers", type=int, help="the first of I-80 alone")
     parser.add_argument("--reference", type=Path, required=True, help="made where it is missing")
     options = parser.parse_args()
     limit_cores(1)
@@ -140,17 +183,20 @@ def main() -> None:
     for name, chosen in _RECORDINGS:
         dataset = TidyDataset(path=str(_DATA / f"{name}.parquet"), **chosen)
         batches.append(PairBatch.of(dataset.load()))
+    if options.drivers is not None:
+        batches = [batches[0][: options.drivers]]
     known: dict[str, list[float]] = {}
     if options.reference.exists():
         known = json.loads(options.reference.read_text())
     columns = ["model", "objective", "reference", *options.optimizers]
     print("| " + " | ".join(columns) + " |\n" + "| --- " * len(columns) + "|")
     for model in options.models:
-        for objective in _OBJECTIVES:
+        for objective in ("speed_rmse",) if options.plain else _OBJECTIVES:
             losses = [losses_of(model, objective, batch) for batch in batches]
             key = f"{model} {objective}"
             if key not in known:
-                known[key] = [value for one in losses for value in reference(one)]
+                loop = model if options.plain else None
+                known[key] = [value for one in losses for value in reference(one, loop)]
                 options.reference.write_text(json.dumps(known))
             cells = [model, objective, f"{np.mean(known[key]):.4f}"]
             for name in options.optimizers:

@@ -22,12 +22,13 @@ from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import CandidateLosses, Optimizer
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.rmse import GapRmse, SpeedRmse
+from cfx.calibration.shade import ShadeSearch
 from cfx.calibration.shards import CalibrationShard, Solver
 from cfx.calibration.theil_u import TheilInequality
 from cfx.core import threads
 from cfx.core.engine import Engine, Report
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.errors import OutputError
+from cfx.errors import ConfigError, OutputError
 from cfx.models.base import DrivingModel
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
@@ -65,13 +66,13 @@ class Counting(RandomSearch):
 
 
 def calibrator(
-    optimizer: RandomSearch,
+    optimizer: Optimizer,
     folder: Path | None = None,
     model: DrivingModel | None = None,
     **changes: Any,
 ) -> Calibrator:
     of_solver: dict[str, Any] = {"seed": 0, "memory": 1 << 28}
-    for name in ("seed", "memory", "objective", "prior"):
+    for name in ("seed", "memory", "objective", "prior", "pooled_segment_s"):
         if name in changes:
             of_solver[name] = changes.pop(name)
     solver = Solver(MemoryStepper(model or Krauss(), 0.1), optimizer, **of_solver)
@@ -106,6 +107,36 @@ def test_constant_true_parameters_are_recovered(
         zip(model.space.names, ((fixed - true).abs() / (high - low)).amax(0).tolist(), strict=True)
     )
     assert all(error[name] < limit for name, limit in tolerance.items()), error
+
+
+def test_ends_are_not_apart_where_drivers_are_followed_exactly() -> None:
+    pairs, last = wavy_pairs(Krauss(), TRUE, frames=400), torch.full((3,), 390)
+    tool = calibrator(ShadeSearch())
+    batch = PairBatch.of(pairs)
+    found = tool.driver_specific(pairs, batch, last)
+    assert float((found[:, 0] - TRUE[:, 0]).abs().max()) < 1e-3
+    assert max(tool.apart(pairs, last)) < 0.01
+
+
+def test_pooled_parameters_are_those_of_segments_of_the_length_that_is_asked(
+    tmp_path: Path,
+) -> None:
+    # What a noisy speed says of t_r depends on how long an error may grow.
+    pairs = wavy_pairs(Krauss(), TRUE, frames=300)
+    batch, last = PairBatch.of(pairs), torch.full((len(pairs),), 240)
+    noise = torch.randn(batch.follower_speed.shape, generator=torch.Generator().manual_seed(0))
+    batch = replace(batch, follower_speed=(batch.follower_speed + 0.5 * noise).clamp(min=0.0))
+    members = torch.ones((1, len(pairs)), dtype=torch.bool)
+    found = {}
+    for length in (None, 24.0, 5.0, 0.5):
+        tool = calibrator(RandomSearch(samples=256), tmp_path, pooled_segment_s=length)
+        found[length] = tool.pooled(pairs, batch, last, members)
+    assert torch.equal(found[24.0], found[None])  # they last 24 s
+    assert not torch.equal(found[5.0], found[None])
+    assert not torch.equal(found[0.5], found[5.0])
+    tool = calibrator(RandomSearch(samples=256), pooled_segment_s=0.04)
+    with pytest.raises(ConfigError, match="shorter than the time step"):
+        tool.pooled(pairs, batch, last, members)
 
 
 def test_labels_follow_a_driver_who_changes() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from cfx.calibration.losses import FullTrajectories, PooledLosses, SegmentLosses
+from cfx.calibration.losses import PooledLosses, SegmentLosses, TrajectorySegments
 from cfx.calibration.mixed import Mixed
 from cfx.calibration.objectives import FrameValues, Objective
 from cfx.calibration.rmse import GapRmse, SpeedRmse
@@ -108,7 +108,7 @@ def test_many_trajectories_are_simulated_some_after_the_other(
     candidates = torch.rand(
         (2, 7, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
     )
-    trajectories = FullTrajectories(stepper, objective, batch, last)
+    trajectories = TrajectorySegments.of_pairs(stepper, objective, batch, last)
     for asked in (candidates, candidates[:1].expand(2, -1, -1)):
         expected = PooledLosses(segments, members, memory=1 << 30)(asked)
         pooled = PooledLosses(trajectories, members, memory=1 << 30)
@@ -116,6 +116,36 @@ def test_many_trajectories_are_simulated_some_after_the_other(
         monkeypatch.setattr("cfx.calibration.losses._SEGMENTS_AT_ONCE", 1)
         torch.testing.assert_close(pooled(asked), expected)
         monkeypatch.undo()
+
+
+@pytest.mark.parametrize("length", [5, 60, 149, 1000, None])
+def test_pieces_of_trajectories_hold_each_frame_once_and_pairs_count_alike(
+    length: int | None,
+) -> None:
+    batch = PairBatch.of(wavy_pairs(Krauss(), TRUE))
+    last = torch.tensor([150, 150, 90])
+    stepper, objective = MemoryStepper(Krauss(), 0.1), SpeedRmse()
+    pieces = TrajectorySegments.of_pairs(stepper, objective, batch, last, length)
+    for pair, end in enumerate(last.tolist()):
+        mine = pieces.pair == pair
+        first, lasts = pieces.first[mine].tolist(), pieces.last[mine].tolist()
+        assert [*first[1:], end] == lasts
+        assert first[0] == 0
+        assert len(first) == max(1, round(end / (length or end)))
+    candidates = torch.rand(
+        (1, 4, 2), generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    of_pieces = pieces.take(torch.arange(pieces.problems))(
+        candidates.expand(pieces.problems, -1, -1)
+    )
+    means = torch.stack([of_pieces[pieces.pair == pair].mean(0) for pair in range(3)])
+    members = torch.ones((1, 3), dtype=torch.bool)[:, pieces.pair]
+    pooled = PooledLosses(pieces, members, 1 << 30, pieces.weight)
+    torch.testing.assert_close(pooled(candidates), means.mean(0, keepdim=True))
+    # Another problem's candidates, so that pieces are simulated for each.
+    two = PooledLosses(pieces, members.expand(2, -1), 1 << 30, pieces.weight)
+    other = torch.cat([candidates, 1.0 - candidates])
+    torch.testing.assert_close(two(other)[:1], means.mean(0, keepdim=True))
 
 
 def test_a_segment_that_diverges_spoils_only_its_own_problems() -> None:

@@ -317,6 +317,7 @@ def compose(
         memory=bound,
         prior=prior_weight(config.calibration.prior),
         chooses_prior=config.calibration.prior == "chosen",
+        pooled_segment_s=config.calibration.pooled_segment_s,
     )
     reported = {}
     for entry in registry.entries("objective"):  # cfx's own and the chosen one

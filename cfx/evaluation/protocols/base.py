@@ -22,7 +22,7 @@ from cfx.core.engine import Engine
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import LearnedFrom, PairBatch, PairSet
 from cfx.data.style import StyleResult
-from cfx.errors import DataError, PluginError
+from cfx.errors import ConfigError, DataError, PluginError
 from cfx.evaluation.closed_loop import (
     ClosedLoop,
     Followers,
@@ -106,6 +106,19 @@ class ProtocolContext:
     def engine(self) -> Engine:
         """Where calibration, training and evaluation run."""
         return self.calibrator.engine
+
+    def refuse_segments(self) -> None:
+        """Refuses a setting of pooled parameters where a job calibrates none.
+
+        Raises:
+            ConfigError: it has a value.
+        """
+        length = self.calibrator.solver.pooled_segment_s
+        if length is not None:
+            raise ConfigError(
+                f"calibration.pooled_segment_s={length:g}: this job calibrates no pooled"
+                " parameters, so it does nothing; leave it out, or set protocol=across_drivers"
+            )
 
     @cached_property
     def _quantiles(self) -> dict[str, tuple[float, ...]]:

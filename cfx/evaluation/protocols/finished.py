@@ -76,6 +76,7 @@ class FinishedPolicy:
         """
         policy, pairs, batch = self.agent, context.pairs, context.batch
         self.check(pairs)
+        context.refuse_segments()
         device = batch.lengths.device
         policy = policy.to(device)
         split = Split.of(pairs, context.windows, context.split)

@@ -50,6 +50,7 @@ class WithinDriver(Protocol):
     def run(self, context: ProtocolContext) -> ProtocolResult:
         pairs, batch = context.pairs, context.batch
         context.check_start(context.pairs)
+        context.refuse_segments()
         split = Split.of(pairs, context.windows, context.split)
         whole = context.split == 1 and not context.policy.trainable
         if whole:

@@ -72,6 +72,16 @@ def test_files_and_settings_become_the_job_that_the_command_line_runs(pairs: Pat
     assert own[2:] == ["data=tidy", "data.path=absent.csv", "data.columns.speed=v"]
 
 
+def test_a_setting_of_pooled_parameters_is_refused_where_none_are_calibrated(
+    pairs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = [str(pairs), *QUICK, "calibration.pooled_segment_s=5"]
+    assert cli.main(["calibrate", *words]) == 2
+    assert "calibration.pooled_segment_s=5: this job calibrates no pooled parameters" in (
+        capsys.readouterr().err
+    )
+
+
 def test_a_policy_to_train_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"trains no policy: leave policy=gru out"):
         overrides_of(["pairs.csv", "policy=gru"])

@@ -99,3 +99,10 @@ def test_a_budget_is_kept(samples: int) -> None:
 def test_labels_and_pooled_parameters_are_searched_by_gradients() -> None:
     assert ShadeSearch().brief().settings.samples == 4096
     assert ShadeSearch(samples=64).brief().settings.samples == 64
+    assert isinstance(ShadeSearch().of_pooled(), GradientSearch)
+
+
+def test_populations_search_pooled_parameters_where_that_is_asked() -> None:
+    optimizer = ShadeSearch(pooled_samples=20_000).of_pooled()
+    assert isinstance(optimizer, ShadeSearch)
+    assert optimizer.settings.samples == 20_000
