@@ -17,7 +17,7 @@ Shapes: P drivers, n tuned parameters, d coordinates.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -64,12 +64,12 @@ class Population:
         return self.space.from_unit(torch.sigmoid(logits))
 
 
-def fit_population(posterior: Posterior, starts: Tensor) -> tuple[Population, Posterior, Normal]:
+def fit_population(posterior: Posterior, normal: Normal) -> tuple[Population, Posterior, Normal]:
     """Finds the population of drivers, and each driver's posterior within it.
 
     Args:
         posterior: of P drivers, with the prior that the model's bounds and defaults give.
-        starts: `(P, S, n)`, logits at which searches start.
+        normal: Laplace's approximation of it.
 
     Returns:
         The population, the posterior with it as the prior, and Laplace's approximation of that.
@@ -80,12 +80,12 @@ def fit_population(posterior: Posterior, starts: Tensor) -> tuple[Population, Po
     middle = first.quantiles(half, n)[0]
     spread = torch.linalg.inv(first.precision)
     population = Population(posterior.space, middle, spread)
-    within, normal = posterior, laplace(posterior, starts)
+    within = posterior
     for _ in range(_ROUNDS):
         precision, pull = _said(within.prior, normal, n)
         population = _expected(precision, pull, population, middle, spread)
-        within = Posterior(posterior.segments, population.prior, posterior.order, posterior.stride)
-        normal = laplace(within, normal.mode[:, None, :n])
+        within = replace(posterior, prior=population.prior)
+        normal = laplace(within, normal.mode[:, None, : posterior.simulated])
     return population, within, normal
 
 

@@ -24,7 +24,7 @@ def test_mean_and_covariance_are_found_and_drivers_are_nearer_to_the_truth() -> 
     weak = drawn.posterior
     assert weak.prior.center is not None
     starts = weak.prior.center.expand(60, 1, -1)
-    population, within, normal = fit_population(weak, starts)
+    population, within, normal = fit_population(weak, laplace(weak, starts))
     torch.testing.assert_close(population.mean, TRUE.mean, atol=0.15, rtol=0)
     torch.testing.assert_close(population.covariance, TRUE.covariance, atol=0.15, rtol=0)
     assert within.prior.center is population.mean
