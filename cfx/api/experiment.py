@@ -163,7 +163,8 @@ def train(
         'geometric'
     """
     refuse_unused(settings, {**NOTHING_KEPT, "experiment": "give it as for_=NAME"})
-    return config(pairs, experiment=for_, model=model, seed=seed, **settings).run()
+    recording, others = pairs_from(pairs, settings), without_data(settings)
+    return config(recording, experiment=for_, model=model, seed=seed, **others).run()
 
 
 def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings: Any) -> Result:
@@ -195,7 +196,7 @@ def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings:
     """
     with in_folder(policy) as folder:
         chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
-        return config(pairs, **chosen).run()
+        return config(pairs_from(pairs, settings), **without_data(chosen)).run()
 
 
 NOTHING_KEPT = {

@@ -498,6 +498,13 @@ class Fits(ResultTable):
             "how likely a fan that is right holds as little; below 0.05 the interval is in doubt",
             required=False,
         ),
+        Column(
+            "doubt",
+            "",
+            "why the interval is not to be taken at its word; empty where nothing is known",
+            "text",
+            required=False,
+        ),
         Column("effective_samples", "1", "effective sample size of the intervals", required=False),
         Column(
             "pareto_k", "1", "above 0.7 these intervals are not to be relied on", required=False

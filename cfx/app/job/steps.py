@@ -23,7 +23,7 @@ from cfx.calibration.losses import prior_weight
 from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import Optimizer
 from cfx.calibration.posterior import posterior_method
-from cfx.calibration.settings import CalibrationSettings
+from cfx.calibration.settings import CalibrationSettings, doubts
 from cfx.calibration.shards import Solver
 from cfx.core import registry
 from cfx.core.distributions import OWN
@@ -113,7 +113,9 @@ def calibration_tables(
                 solver = context.calibrator.solver
                 method_of = posterior_method(settings.posterior)
                 known = method_of.find(solver, batch, last, parameters, settings)
-                rows = rows.join(pd.DataFrame(known.columns(), index=ids), on="pair_id")
+                intervals = pd.DataFrame(known.columns(), index=ids)
+                intervals["doubt"] = doubts(intervals)
+                rows = rows.join(intervals, on="pair_id")
                 tables = known.tables(ids)
             fits.append(rows)
     if not elsewhere:

@@ -180,9 +180,22 @@ class Posterior:
         return self.segments.segments.counted[self.stride - 1 :: self.stride, :, None]
 
     @property
+    def scored(self) -> Tensor:
+        """The same without the first one, `(K, P, 1)`.
+
+        The simulation starts from a measured state, which is as wrong as any other. Models that
+        forget it within a step have an error after the first that says nothing of the noise's
+        innovations, those that remember have hardly any: the density is of all errors given the
+        first. Scored too, intervals of Krauss's t_r held 82 instead of 88 %.
+        """
+        scored = self.counted.clone()
+        scored[0] = 0.0
+        return scored
+
+    @property
     def count(self) -> Tensor:
-        """The number of these steps, `(P, 1)`."""
-        return self.counted.sum(0)
+        """The number of scored steps, `(P, 1)`."""
+        return self.scored.sum(0)
 
     @property
     def bytes_per_candidate(self) -> int:
@@ -240,14 +253,14 @@ class Posterior:
     def residual(self, place: Tensor) -> Tensor:
         """Returns what noise leaves of the errors of coordinates `(P, q, d)`, `(K, P, q)`."""
         phi = noise.coefficients(place[..., self.simulated : -1])
-        return noise.filtered(self.errors(place), phi) * self.counted
+        return noise.filtered(self.errors(place), phi) * self.scored
 
     def products(self, place: Tensor) -> Tensor:
         """Returns sums of lagged products of errors at coordinates `(P, q, s)`, or more.
 
         `(P, q, m + 1, m + 1)`.
         """
-        return noise.lagged_products(self.errors(place), self.counted, self.order)
+        return noise.lagged_products(self.errors(place), self.scored, self.order)
 
     def __call__(self, place: Tensor) -> Tensor:
         """Returns the log density of coordinates `(P, q, d)`, `(P, q)`."""

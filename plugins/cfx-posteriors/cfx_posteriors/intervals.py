@@ -284,9 +284,15 @@ class HierarchicalMethod(PosteriorMethod):
         best: Tensor,
         settings: CalibrationSettings,
     ) -> ParameterIntervals:
-        noise = choose_noise(solver, batch, last, best, settings)
-        population, posterior, normal = fit_population(noise.posterior, noise.normal)
-        sampled = _sampled(solver, posterior, normal)
+        with threads.one_thread():
+            noise = choose_noise(solver, batch, last, best, settings)
+
+        def draw(posterior: Posterior, normal: Normal) -> Tensor:
+            return _sampled(solver, posterior, normal).draws
+
+        with threads.one_thread():
+            population, posterior, normal = fit_population(noise.posterior, noise.normal, draw)
+            sampled = _sampled(solver, posterior, normal)
         return _intervals(solver, batch, last, noise, (posterior, normal.mode, population, sampled))
 
 

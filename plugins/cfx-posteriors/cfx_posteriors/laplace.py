@@ -205,13 +205,13 @@ def _around(posterior: Posterior, place: Tensor) -> _Around:
     errors = posterior.errors(asked.flatten(1, 2)).view(-1, drivers, searches, 1 + n)
     middle = errors[..., 0]
     slopes = (errors[..., 1:] - errors[..., :1]) / DIFFERENCE
-    products = noise.lagged_products(middle, posterior.counted, order)
+    products = noise.lagged_products(middle, posterior.scored, order)
     value = noise.log_density(products, posterior.count, place[..., n:])
     value = value + posterior.prior_log_density(logits)
 
     squashed, log_scale = place[..., n:-1], place[..., -1]
     phi, turned = _coefficients_and_slopes(squashed)
-    counted = posterior.counted
+    counted = posterior.scored
     residual = noise.filtered(middle, phi) * counted
     jacobian = torch.empty((*residual.shape, d - 1), dtype=place.dtype, device=place.device)
     for k in range(n):
