@@ -13,6 +13,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
 
+import numpy as np
+import pandas as pd
 import torch
 
 import cfx
@@ -37,7 +39,7 @@ def rows(name: str, method: str, drivers: int, durations: Sequence[float]) -> It
     """Yields a row of a Markdown table for each kind of noise and duration."""
     model = cast(DrivingModel, create("model", {"name": name}))
     names = list(model.space.names)
-    yield f"| noise | s | chosen | reliable | all | {' | '.join(names)} |"
+    yield f"| noise | s | chosen | held | settled | held by these | {' | '.join(names)} |"
     for noise in NOISES:
         for seconds in durations:
             recordings, truth = simulate(name, noise, drivers, seconds, seed=7, recording=I80)
@@ -53,12 +55,13 @@ def rows(name: str, method: str, drivers: int, durations: Sequence[float]) -> It
             for parameter in names:
                 value = truth[parameter].to_numpy()
                 low, high = columns[f"low_{parameter}"], columns[f"high_{parameter}"]
-                held.append(float(((low <= value) & (value <= high)).mean()))
-            reliable = float(are_reliable(columns).mean())  # type: ignore[arg-type]  # a mapping of columns does
-            shares = " | ".join(f"{share:.0%}" for share in held)
-            mean = sum(held) / len(held)
-            kind = columns["noise"][0]
-            yield f"| {noise} | {seconds:.0f} | {kind} | {reliable:.0%} | {mean:.0%} | {shares} |"
+                held.append((low <= value) & (value <= high))
+            within = np.stack(held, axis=1)
+            settled = np.asarray(are_reliable(pd.DataFrame(columns)))
+            cells = [noise, f"{seconds:.0f}", columns["noise"][0], f"{within.mean():.0%}"]
+            cells += [f"{settled.mean():.0%}", f"{within[settled].mean():.0%}"]
+            cells += [f"{share:.0%}" for share in within.mean(axis=0)]
+            yield f"| {' | '.join(cells)} |"
 
 
 if __name__ == "__main__":
