@@ -20,8 +20,9 @@ from cfx.api.pairs import Pairs, read
 from cfx.app.job import steps
 from cfx.calibration.identifiability import losses_of
 from cfx.core.guest import visit
+from cfx.data.frames import Frame, frame_of_source
 from cfx.data.tidy import row_order
-from cfx.errors import DataError
+from cfx.errors import ConfigError, DataError
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.simulation.windows import Split
 
@@ -29,7 +30,8 @@ from cfx.simulation.windows import Split
 class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc] # no types
     """Pooled calibration of a driving model: fitted on some drivers, it predicts others' speeds.
 
-    A sample is a row of a table in the tidy layout: one frame of one pair. Rows of a pair belong
+    A sample is a row of a table in the tidy layout, in a data frame of any library that `cfx.read`
+    takes: one frame of one pair. Rows of a pair belong
     together: split them by `groups`, as `GroupKFold` does.
 
     Of scikit-learn's `check_estimator` those checks apply, and pass, that are about parameters,
@@ -73,7 +75,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         self.seed = seed
         self.settings = settings
 
-    def fit(self, X: pd.DataFrame, y: object = None, groups: ArrayLike | None = None) -> Self:  # noqa: N803 - scikit-learn's name
+    def fit(self, X: Any, y: object = None, groups: ArrayLike | None = None) -> Self:  # noqa: N803 - scikit-learn's name
         """Calibrates one set of parameters on the whole trajectories.
 
         Args:
@@ -84,12 +86,13 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         Raises:
             CfxError: the table is not in the layout, or a parameter is wrong.
         """
-        self.parameters_ = self._pooled(self._pairs(X))
-        self.feature_names_in_ = np.asarray(X.columns.astype(str), dtype=object)
-        self.n_features_in_ = len(X.columns)
+        table = _table(X)
+        self.parameters_ = self._pooled(_pairs(table))
+        self.feature_names_in_ = np.asarray(table.names, dtype=object)
+        self.n_features_in_ = len(table.names)
         return self
 
-    def predict(self, X: pd.DataFrame) -> NDArray[np.float64]:  # noqa: N803 - as above
+    def predict(self, X: Any) -> NDArray[np.float64]:  # noqa: N803 - as above
         """Simulates each follower from the first row of their pair on, in closed loop.
 
         Args:
@@ -99,13 +102,14 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
             The followers' speeds in the order of the rows, m/s.
         """
         check_is_fitted(self)
-        pairs = self._pairs(X)
-        drive = simulate(self.model, self.parameters_, pairs, **(self.settings or {}))
-        speed = np.empty(len(X))
-        speed[row_order(X)] = drive["speed"]
+        table = _table(X)
+        drive = simulate(self.model, self.parameters_, _pairs(table), **(self.settings or {}))
+        order = row_order(table)
+        speed = np.empty(len(order))
+        speed[order] = drive["speed"]
         return speed
 
-    def score(self, X: pd.DataFrame, y: object = None) -> float:  # noqa: N803 - as above
+    def score(self, X: Any, y: object = None) -> float:  # noqa: N803 - as above
         """Returns minus the mean loss over the pairs, in the objective's unit: greater is better.
 
         Args:
@@ -113,7 +117,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
             y: is not read.
         """
         check_is_fitted(self)
-        context, last = self._prepared(self._pairs(X))
+        context, last = self._prepared(_pairs(_table(X)))
         values = torch.tensor(self.parameters_.to_numpy(dtype=np.float64))
         unit = context.space.to_unit(values.to(context.batch.leader_length))
         candidates = unit.expand(len(context.batch), 1, -1)
@@ -122,19 +126,6 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
                 context.calibrator, context.objective, context.batch, last, candidates
             )
         return -float(losses.mean())
-
-    def _pairs(self, table: pd.DataFrame) -> Pairs:
-        """Returns the pairs of a table.
-
-        Raises:
-            DataError: it is none, or not in the layout.
-        """
-        if not isinstance(table, pd.DataFrame):
-            raise DataError(
-                f"X is of type {type(table).__name__}; give a pandas data frame in the tidy layout,"
-                " a row per pair and frame"
-            )
-        return read(table, min_duration=0)  # every row of a table counts
 
     def _prepared(self, pairs: Pairs) -> tuple[ProtocolContext, Tensor]:
         """Returns what calibrates, and the last frame of each pair."""
@@ -159,3 +150,30 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         tags.target_tags.required = False
         tags.no_validation = True
         return tags
+
+
+def _table(source: Any) -> Frame:
+    """Returns a data frame of any library.
+
+    Raises:
+        DataError: it is none.
+    """
+    try:
+        table = frame_of_source(source)
+    except ConfigError as error:
+        raise DataError(f"X: {error}") from None
+    if table is None:
+        raise DataError(
+            f"X is of type {type(source).__name__}; give a data frame in the tidy layout, a row per"
+            " pair and frame"
+        )
+    return table
+
+
+def _pairs(table: Frame) -> Pairs:
+    """Returns the pairs of a table; every row counts.
+
+    Raises:
+        DataError: it is not in the tidy layout.
+    """
+    return read(table, min_duration=0)

@@ -46,7 +46,8 @@ _SPEED_SD_MPS, _SPEED_SCALE_S = 0.8, 6.0  # the leader's own variation of speed
 _ACCELERATION_MPS2, _BRAKING_MPS2, _JERK_MPS3 = 1.8, 2.5, 1.5
 _RESPONSE_PER_S = 0.5
 _DRIFT_SCALE_S = 8.0  # over which a driver's parameters change
-_LENGTH_M = (4.2, 5.2)
+LENGTH_M = (4.2, 5.2)
+"""m: between which vehicles' lengths are."""
 _BYTES = 200.0  # of a pair and frame: signals, and the true parameters over time
 
 
@@ -160,20 +161,17 @@ def _simulate(s: SyntheticSettings, platoons: int, rng: np.random.Generator) -> 
     windows = math.ceil(frames / hold)
     unit = _true_parameters(model.space, (platoons, s.platoon_size), windows, hold * s.dt, s, rng)
     parameters = model.space.from_unit(torch.from_numpy(unit))
-    length = torch.from_numpy(rng.uniform(*_LENGTH_M, (platoons, s.platoon_size + 1)))
+    length = torch.from_numpy(rng.uniform(*LENGTH_M, (platoons, s.platoon_size + 1)))
     speed = torch.from_numpy(leader_speed(platoons, frames, s.dt, rng, s.cruise_mps))
-    moved = (speed[:, 1:] * s.dt).cumsum(1)
-    positions = [torch.cat([torch.zeros(platoons, 1, dtype=speed.dtype), moved], 1)]
-    speeds = [speed]
-    for k in range(s.platoon_size):
-        position, speed = _follow(
-            model, parameters[:, k], positions[k], speeds[k], length[:, k], hold, s
+    position, speed, collided = simulate_platoons(model, parameters, speed, length, hold, s.dt)
+    if collided:
+        raise DataError(
+            f"synthetic data: a driver of data.model={s.model} collides with seed {s.seed};"
+            " lower data.variation or data.heterogeneity, or take another data.seed"
         )
-        positions.append(position)
-        speeds.append(speed)
-    all_speeds = torch.stack(speeds, 1).numpy()
+    all_speeds = speed.numpy()
     return _Traffic(
-        position=torch.stack(positions, 1).numpy()[..., warm:],
+        position=position.numpy()[..., warm:],
         speed=all_speeds[..., warm:],
         acceleration=differences(all_speeds, s.dt)[..., warm:],
         length=length.numpy(),
@@ -182,18 +180,26 @@ def _simulate(s: SyntheticSettings, platoons: int, rng: np.random.Generator) -> 
     )
 
 
-def _follow(
+def simulate_platoons(
     model: DrivingModel,
     parameters: Tensor,
-    leader_position: Tensor,
     leader_speed: Tensor,
-    leader_length: Tensor,
+    length: Tensor,
     hold: int,
-    s: SyntheticSettings,
-) -> tuple[Tensor, Tensor]:
-    """Simulates one place of all S platoons; returns positions and speeds `(S, F)`.
+    dt: float,
+) -> tuple[Tensor, Tensor, bool]:
+    """Simulates S platoons of V - 1 followers; each vehicle is the leader of the next.
 
-    Parameters `(S, W, n)` hold for `hold` frames each; the leaders are `(S, F)`.
+    Args:
+        model: by which they drive.
+        parameters: `(S, V - 1, W, n)`; each of the W windows is `hold` frames.
+        leader_speed: of the first vehicle, `(S, F)`, m/s.
+        length: of the vehicles, `(S, V)`, m.
+        hold: frames for which parameters hold.
+        dt: time step, s.
+
+    Returns:
+        Positions (m) and speeds (m/s) of all vehicles, `(S, V, F)`, and whether any collided.
     """
     import torch
 
@@ -201,20 +207,23 @@ def _follow(
     from cfx.simulation.rollout import simulate_follower
     from cfx.simulation.trajectory import Start
 
-    acceleration = torch.from_numpy(differences(leader_speed.numpy(), s.dt))
-    leader = Leader(leader_position, leader_speed, acceleration, leader_length)
-    begin = leader_position[:, 0] - leader_length - 5.0 - 2.0 * leader_speed[:, 0]
-    start = Start(begin, leader_speed[:, 0], torch.zeros_like(begin))
-    # Never compiled: eager arithmetic gives the same bits wherever there is the same seed.
-    trajectory = simulate_follower(
-        model, parameters, leader, start, s.dt, window=hold, compile="never"
-    )
-    if trajectory.collided.any():
-        raise DataError(
-            f"synthetic data: a driver of data.model={s.model} collides with seed {s.seed};"
-            " lower data.variation or data.heterogeneity, or take another data.seed"
+    moved = (leader_speed[:, 1:] * dt).cumsum(1)
+    positions = [torch.cat([torch.zeros_like(leader_speed[:, :1]), moved], 1)]
+    speeds, collided = [leader_speed], False
+    for place in range(length.shape[1] - 1):
+        position, speed = positions[-1], speeds[-1]
+        acceleration = torch.from_numpy(differences(speed.numpy(), dt))
+        leader = Leader(position, speed, acceleration, length[:, place])
+        begin = position[:, 0] - length[:, place] - 5.0 - 2.0 * speed[:, 0]
+        start = Start(begin, speed[:, 0], torch.zeros_like(begin))
+        # Never compiled: eager arithmetic gives the same bits wherever there is the same seed.
+        trajectory = simulate_follower(
+            model, parameters[:, place], leader, start, dt, window=hold, compile="never"
         )
-    return trajectory.position, trajectory.speed
+        collided = collided or bool(trajectory.collided.any())
+        positions.append(trajectory.position)
+        speeds.append(trajectory.speed)
+    return torch.stack(positions, 1), torch.stack(speeds, 1), collided
 
 
 def _model(name: str) -> DrivingModel:

@@ -6,6 +6,8 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import polars
+import pyarrow as pa
 import pytest
 from sklearn.exceptions import NotFittedError
 from sklearn.model_selection import GroupKFold, cross_val_score
@@ -70,6 +72,21 @@ def test_rows_are_matched_however_pairs_and_times_are_written(
         np.testing.assert_array_equal(fitted.predict(again), predicted)
 
 
+def test_tables_of_other_libraries_are_tables_too(
+    fitted: CarFollowingRegressor, table: pd.DataFrame
+) -> None:
+    predicted, score = fitted.predict(table), fitted.score(table)
+    for other in (polars.from_pandas(table), pa.Table.from_pandas(table), dict(table.items())):
+        np.testing.assert_array_equal(fitted.predict(other), predicted)
+        assert fitted.score(other) == score
+    frame = polars.from_pandas(table)
+    again = CarFollowingRegressor("idm", settings=SETTINGS).fit(frame)
+    assert again.parameters_.equals(fitted.parameters_)
+    assert again.feature_names_in_.tolist() == frame.columns
+    scores = cross_val_score(again, frame, cv=GroupKFold(2), groups=table["pair_id"].to_numpy())
+    assert np.isfinite(scores).all()
+
+
 def test_its_score_is_the_loss_of_its_parameters(
     fitted: CarFollowingRegressor, table: pd.DataFrame
 ) -> None:
@@ -91,7 +108,7 @@ def test_what_is_no_table_is_refused(table: pd.DataFrame) -> None:
     with pytest.raises(NotFittedError):
         CarFollowingRegressor().predict(table)
     given: Any = np.zeros((4, 3))
-    with pytest.raises(DataError, match="give a pandas data frame"):
+    with pytest.raises(DataError, match="X: an array has no names of columns"):
         CarFollowingRegressor().fit(given)
     with pytest.raises(ConfigError, match="there is no model 'idn'"):
         CarFollowingRegressor("idn").fit(table)

@@ -23,6 +23,7 @@ from cfx.data.pairs import PairBatch
 from cfx.data.signals import RECORDED
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.settings import RolloutSettings
+from cfx.learners.rollout.simulated import QUEUES, SITES
 from cfx.policies.base import Policy
 from cfx.policies.core import Grid
 from cfx.policies.driver_features import measure
@@ -171,6 +172,10 @@ class RolloutDataset:
     Attributes:
         recordings: of the U pairs.
         pair: which of the U pairs stands at each place, `(N, B)`.
+        known_as: whose driver features a place's driver has, `(N, B)`: of the U pairs, the driver's
+            own, or a recorded driver's whom a simulated one stands for.
+        in_queue: which drivers leave a simulated queue, bool `(N, B)`; nothing makes a motorway of
+            their street.
         trains, validates: what a place is used for, bool `(N, B)`.
         until: last frame that training may use, `(N, B)`.
         last: last frame of the training part, `(N, B)`.
@@ -186,6 +191,8 @@ class RolloutDataset:
 
     recordings: Recordings
     pair: Tensor
+    known_as: Tensor
+    in_queue: Tensor
     trains: Tensor
     validates: Tensor
     until: Tensor
@@ -249,10 +256,16 @@ class RolloutDataset:
         windows = torch.arange(seen.shape[1], device=device) * training_data.windows.stride
         counted = trained_by_any[..., None] & (windows <= until[first, :, None])
         placed = base[pair]
-        scaler = _scaler(seen, placed[first], driver_features, of_driver[first], counted)
+        in_queue = present & _at_sites(training_data, (QUEUES,))[pair]
+        known_as = _known_as(training_data, pair, present, row, driver_features, time_gap, in_queue)
+        scaler = _scaler(
+            seen, placed[first], driver_features, of_driver[first], known_as[first], counted
+        )
         return cls(
             recordings=Recordings(batch, recorded, seen, driver_features, time_gap),
             pair=of_driver,
+            known_as=known_as,
+            in_queue=in_queue,
             trains=trains,
             validates=present & (few | kept) & (validation > 0),
             until=until,
@@ -272,7 +285,8 @@ class RolloutDataset:
 
         What is sampled for a network does not depend on which others stand beside it.
         """
-        rows, pair = torch.unique(self.pair[networks], return_inverse=True)
+        both = torch.stack([self.pair[networks], self.known_as[networks]])
+        rows, (pair, known_as) = torch.unique(both, return_inverse=True)
         recordings = self.recordings
         if len(rows) < len(recordings.pair):
             recordings = recordings[rows]
@@ -283,6 +297,8 @@ class RolloutDataset:
             self,
             recordings=recordings,
             pair=pair,
+            known_as=known_as,
+            in_queue=self.in_queue[networks],
             trains=self.trains[networks],
             validates=self.validates[networks],
             until=self.until[networks],
@@ -412,7 +428,8 @@ class RolloutDataset:
         features = squashed(base)
         count = self.recordings.driver_features.shape[-1]
         if count > 0:
-            measured = self.recordings.driver_features[pair]
+            known_as = self.known_as.gather(1, batch.place)
+            measured = self.recordings.driver_features[known_as]
             usual = self.scaler.mean[:, None, -count:]
             read = torch.where(cold_start | measured.isnan(), usual, measured)
             features = torch.cat([features, read], -1)
@@ -611,8 +628,60 @@ def _driver_features(
     return measure(batch, policy.driver_features, dt, since, until).float()
 
 
+def _at_sites(training_data: TrainingData, sites: Sequence[str]) -> Tensor:
+    """Returns which of the P pairs are at some sites, bool `(P,)`."""
+    pairs = training_data.pairs
+    is_there = [site in sites for site in pairs.sites or ("",) * len(pairs)]
+    return torch.tensor(is_there, device=training_data.device)
+
+
+def _known_as(
+    training_data: TrainingData,
+    pair: Tensor,
+    present: Tensor,
+    row: Tensor,
+    driver_features: Tensor,
+    time_gap: Tensor,
+    in_queue: Tensor,
+) -> Tensor:
+    """Chooses whose driver features each place's driver has, `(N, B)`, of the U pairs.
+
+    A simulated driver who leaves a queue stands for a recorded one of the same network, who was
+    never seen at a light: the driver whose time gap has the same rank among recorded drivers. So
+    networks learn how each of the recorded drivers leaves a queue. All others have their own.
+
+    Args:
+        training_data: says at which sites drivers are.
+        pair: which of the P pairs stands at each place, `(N, B)`.
+        present: which places are taken, bool `(N, B)`.
+        row: which of the U pairs stands for each of the P pairs.
+        driver_features: `(U, k)`, NaN where unknown.
+        time_gap: each driver's usual one, `(U,)`, s.
+        in_queue: which drivers leave a queue, bool `(N, B)`.
+    """
+    known_as = row[pair]
+    is_measured = driver_features.isfinite().all(1)[known_as]
+    if driver_features.shape[1] == 0:
+        return known_as
+    is_recorded = present & is_measured & ~_at_sites(training_data, SITES)[pair]
+    for network, rows in enumerate(known_as):
+        queue, recorded = in_queue[network].nonzero()[:, 0], is_recorded[network].nonzero()[:, 0]
+        if len(queue) == 0 or len(recorded) == 0:
+            continue
+        queue = queue[time_gap[rows[queue]].argsort(stable=True)]
+        recorded = recorded[time_gap[rows[recorded]].argsort(stable=True)]
+        rank = (torch.arange(len(queue), device=pair.device) + 0.5) / len(queue)
+        known_as[network, queue] = rows[recorded[(rank * len(recorded)).long()]]
+    return known_as
+
+
 def _scaler(
-    seen: Tensor, base: Tensor, driver_features: Tensor, pair: Tensor, counted: Tensor
+    seen: Tensor,
+    base: Tensor,
+    driver_features: Tensor,
+    pair: Tensor,
+    known_as: Tensor,
+    counted: Tensor,
 ) -> Scaler:
     """Measures the scaler of each ensemble, one after the other: their windows are many.
 
@@ -621,6 +690,7 @@ def _scaler(
         base: of each place in unit space, `(E, B, n)`.
         driver_features: `(U, k)`, NaN where unknown.
         pair: which pair stands at each place, `(E, B)`.
+        known_as: whose driver features each place's driver has, `(E, B)`.
         counted: windows that are trained on, bool `(E, B, W)`.
     """
     windows = seen.shape[1]
@@ -636,7 +706,7 @@ def _scaler(
 
     def features_of_drivers(ensemble: int) -> _Values:
         for shard in _shards_of_pairs(pair.shape[1]):
-            pairs = pair[ensemble, shard]
+            pairs = known_as[ensemble, shard]
             values = driver_features[pairs].nan_to_num()[:, None].expand(-1, windows, -1)
             yield values[None], (counted[ensemble, shard] & measured[pairs][:, None])[None]
 

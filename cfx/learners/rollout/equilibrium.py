@@ -29,7 +29,7 @@ from cfx.data.steady import VEHICLE_M, SteadyFollowing, relation_of, steady_foll
 from cfx.errors import ConfigError
 from cfx.learners.base import TrainingData
 from cfx.learners.rollout.dataset import Recordings, RolloutBatch, RolloutDataset
-from cfx.learners.rollout.simulated import SITE
+from cfx.learners.rollout.simulated import SITES
 from cfx.learners.rollout.window import Segment
 
 TRAJECTORIES = 16
@@ -84,7 +84,7 @@ class EquilibriumTargets:
         """Measures what each network's drivers do; simulated ones do not count.
 
         Raises:
-            ConfigError: a network's drivers follow steadily at no two speeds.
+            ConfigError: nobody from whom a network learns follows steadily at two speeds.
         """
         recordings = dataset.recordings
         frames = torch.arange(recordings.batch.mask.shape[1], device=dataset.pair.device)
@@ -94,7 +94,7 @@ class EquilibriumTargets:
         names, is_recorded = [], []
         for number in recordings.pair.tolist():
             names.append(drivers[number])
-            is_recorded.append(sites is None or sites[number] != SITE)
+            is_recorded.append(sites is None or sites[number] not in SITES)
         counts = torch.tensor(is_recorded, device=dataset.pair.device)
         grid = np.arange(0.0, 60.0, GRID_MPS)
         gaps, ratios = [], []
@@ -104,9 +104,9 @@ class EquilibriumTargets:
             gap, ratio = _of_network(_rows(following, rows), rows, names, grid)
             if not np.isfinite(gap).any():
                 raise ConfigError(
-                    "learner.equilibrium_weight: fewer than three drivers that a network learns"
-                    " from follow a leader steadily at two speeds, so nothing says which gap they"
-                    " keep; give more recordings, or learner.equilibrium_weight=0"
+                    "learner.equilibrium_weight: nobody from whom a network learns follows a"
+                    " leader steadily at two speeds, so nothing says which gap they keep; give more"
+                    " recordings, or learner.equilibrium_weight=0"
                 )
             gaps.append(torch.as_tensor(gap))
             of_places = torch.full(places.shape, torch.nan, dtype=torch.float64)
@@ -272,6 +272,8 @@ class SteadySampler:
             dataset,
             recordings=recordings,
             pair=every.view(networks, count),
+            known_as=every.view(networks, count),
+            in_queue=~everyone,
             trains=everyone,
             validates=~everyone,
             until=last,
@@ -311,6 +313,9 @@ def _of_network(
     """
     drivers = [names[row] for row in rows.tolist()]
     relation = relation_of(following, drivers)
+    if len(relation.speed) < 2:
+        # Of a few drivers, such as the cars of one campaign, each range of speed counts.
+        relation = relation_of(following, drivers, least=1)
     if len(relation.speed) < 2:
         return np.full_like(grid, np.nan), np.full(len(drivers), np.nan)
     speed, gap = following.speed.cpu().numpy(), following.gap.cpu().numpy()

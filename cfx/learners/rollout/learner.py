@@ -114,7 +114,9 @@ class RolloutLearner(Learner):
             log.info(
                 "The policy does not see the gap; policy.inputs=situation gives smaller errors"
             )
-        training_data = with_simulated_drivers(training_data, s.simulated_drivers)
+        training_data = with_simulated_drivers(
+            training_data, s.simulated_drivers, s.simulated_queues
+        )
         generator = torch.Generator().manual_seed(training_data.seed)
         head = head_class(s.head).for_model(stepper.model)
         dataset = RolloutDataset.of(training_data, policy, head, s, generator)

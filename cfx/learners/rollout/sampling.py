@@ -105,7 +105,8 @@ class TrajectorySampler:
             return None, None
         shape = tuple(place.shape[1:])
         draws, speed = dataset.uniform(shape, generator), dataset.uniform(shape, generator)
-        shift = torch.where(cold_start & (draws < SHIFTED), s.speed_shift * speed, 0.0)
+        is_shifted = cold_start & (draws < SHIFTED) & ~dataset.in_queue.gather(1, place)
+        shift = torch.where(is_shifted, s.speed_shift * speed, 0.0)
         time_gap = dataset.recordings.time_gap[dataset.pair.gather(1, place)]
         return shift, shift * time_gap
 

@@ -128,6 +128,13 @@ class TrajectorySettings(Settings):
         " from whom networks learn too, for roads that are slower than those that were recorded;"
         " 0: none",
     )
+    simulated_queues: int = Field(
+        0,
+        ge=0,
+        le=100_000,
+        description="drivers of IDM who leave queues at lights, from whom networks learn too, for"
+        " streets with lights, of which there is hardly an open recording; 0: none",
+    )
 
 
 class LossSettings(Settings):

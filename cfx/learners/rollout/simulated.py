@@ -1,10 +1,11 @@
 """Simulated drivers, from whom networks learn beside the recorded ones.
 
-Hardly any recording of free traffic has vehicles that crawl, and a policy is wrong where it has
-learned nothing. Drivers of Krauss's model and of IDM, who differ from one another, follow leaders
-in stop-and-go traffic (`cfx.simulation.synthetic`). They are a site of their own, so
-`learner.balance` says how often they are sampled, and no constant parameters are calibrated on
-them: the base of each is the pooled set of the network.
+A policy is wrong where it has learned nothing. Hardly any recording of free traffic has vehicles
+that crawl: drivers of Krauss's model and of IDM, who differ from one another, follow leaders in
+stop-and-go traffic (`cfx.simulation.synthetic`). No open recording has a light: drivers of IDM
+leave queues (`cfx.simulation.queues`). Either are a site of their own, so `learner.balance` says
+how often they are sampled, and no constant parameters are calibrated on them: the base of each is
+the pooled set of the network.
 """
 
 from __future__ import annotations
@@ -17,11 +18,15 @@ from torch import Tensor
 from cfx.data.accelerations import averaged
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.learners.base import TrainingData, TrainingPairs
+from cfx.simulation.queues import queue_pairs
 from cfx.simulation.synthetic import SyntheticDataset
 from cfx.simulation.windows import Split
 
-SITE = "simulated"
-"""Where they drive."""
+STOP_AND_GO, QUEUES = "simulated", "simulated queues"
+"""Their sites."""
+
+SITES = (STOP_AND_GO, QUEUES)
+"""Sites where nobody was recorded."""
 
 _MODELS = ("krauss", "idm")
 """Whose drivers they are, by halves."""
@@ -36,20 +41,33 @@ _LASTS_S = 60.0
 """s: how long each driver is simulated."""
 
 
-def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingData:
+def with_simulated_drivers(
+    training_data: TrainingData, stop_and_go: int, queues: int
+) -> TrainingData:
     """Adds drivers to what each of N networks learns from.
 
     Args:
         training_data: P recorded pairs.
-        count: simulated drivers, S; half of them drive by each model.
+        stop_and_go: drivers in stop-and-go traffic; half of them drive by each model.
+        queues: drivers who leave queues.
 
     Returns:
-        P + N S pairs, one network behind the other.
+        P + N (stop_and_go + queues) pairs, one network behind the other.
     """
-    if count == 0:
-        return training_data
-    frames = training_data.recorded.mask.shape[1]
-    drivers = simulated_drivers(count, training_data.stepper.dt, frames, training_data.seed)
+    frames, dt = training_data.recorded.mask.shape[1], training_data.stepper.dt
+    seed = training_data.seed
+    if stop_and_go > 0:
+        drivers = stop_and_go_drivers(stop_and_go, dt, frames, seed)
+        training_data = _with_drivers(training_data, drivers, STOP_AND_GO)
+    if queues > 0:
+        drivers = queue_drivers(queues, dt, frames, seed)
+        training_data = _with_drivers(training_data, drivers, QUEUES)
+    return training_data
+
+
+def _with_drivers(training_data: TrainingData, drivers: PairSet, site: str) -> TrainingData:
+    """Adds the same S drivers of a site to what each of N networks learns from."""
+    count, frames = len(drivers), training_data.recorded.mask.shape[1]
     pairs = training_data.pairs
     batch = PairBatch.of(drivers, device=training_data.device, frames=frames)
     whole = Split.none(drivers, training_data.windows)
@@ -69,7 +87,7 @@ def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingD
         return tuple(of_all[number] for number in order.tolist())
 
     sites = pairs.sites or ("",) * len(pairs)
-    names = [f"{SITE} {pair.pair_id}" for pair in drivers]
+    names = [f"{site} {pair.pair_id}" for pair in drivers]
     base = pairs.base
     if base is not None:
         base = joined(base, pooled)
@@ -86,12 +104,12 @@ def with_simulated_drivers(training_data: TrainingData, count: int) -> TrainingD
             start=joined(pairs.start, pooled),
             base=base,
             drivers=named(pairs.known_drivers, names),
-            sites=named(sites, [SITE] * count),
+            sites=named(sites, [site] * count),
         ),
     )
 
 
-def simulated_drivers(count: int, dt: float, frames: int, seed: int) -> PairSet:
+def stop_and_go_drivers(count: int, dt: float, frames: int, seed: int) -> PairSet:
     """Simulates drivers in stop-and-go traffic.
 
     Args:
@@ -114,4 +132,9 @@ def simulated_drivers(count: int, dt: float, frames: int, seed: int) -> PairSet:
         )
         for pair in dataset.read():
             pairs.append(replace(pair, pair_id=f"{model} {pair.pair_id}"))
-    return averaged(PairSet(tuple(pairs), SITE))[0]
+    return averaged(PairSet(tuple(pairs), STOP_AND_GO))[0]
+
+
+def queue_drivers(count: int, dt: float, frames: int, seed: int) -> PairSet:
+    """Simulates drivers who leave queues; arguments as of `stop_and_go_drivers`."""
+    return averaged(queue_pairs(count, dt, min(frames, round(_LASTS_S / dt)), seed))[0]

@@ -17,6 +17,7 @@ from typing import Any
 
 import pandas as pd
 import torch
+from omegaconf import OmegaConf
 
 from cfx.errors import ConfigError, DataError, nearest
 from cfx.plugin import (
@@ -32,18 +33,29 @@ from cfx.plugin import (
 from cfx_report.benchmark.recipes import I80, RECIPES
 
 _SOURCES = {
-    "i80": "NGSIM I-80 (U.S. Department of Transportation, public domain), 4:00-4:15 and"
+    I80: "NGSIM I-80 (U.S. Department of Transportation, public domain), 4:00-4:15 and"
     " 5:00-5:15 pm, reconstructed trajectories",
-    "openacc": "OpenACC (Joint Research Centre of the European Commission, CC BY 4.0): ZalaZone,"
-    " Vicolungo, Ispra; resampled to 0.1 s",
+    "ngsim": "NGSIM I-80 (as before), the HOV lane and the on-ramp, smoothed",
+    "openacc": "OpenACC (Joint Research Centre of the European Commission, CC BY 4.0): {},"
+    " resampled to 0.1 s",
+    "tgsim": "freeways of TO 21-426, modeling HV interactions with inconspicuous ACC-equipped"
+    " vehicles (U.S. Department of Transportation, Federal Highway Administration, Saxton"
+    " Transportation Operations Laboratory, Apache License 2.0): smoothed, cut into pairs",
 }
 """Who recorded a file, by how its name begins."""
 
+_PLACES = {"zalazone": "ZalaZone", "vicolungo": "Vicolungo", "ispra": "Ispra"}
+"""Where OpenACC recorded, by what stands in a file's name."""
+
+_LICENCES = {
+    "openacc": "made with OpenACC's recordings, which are CC BY 4.0",
+    "tgsim": "made with recordings of TO 21-426 under the Apache License 2.0",
+}
+"""What is said of weights that learned from a file, by how its name begins; all others are in the
+public domain."""
+
 TRAFFIC_STEP = "0.5"
 """s: step of SUMO at which a card's traffic is measured, in the middle of usual ones."""
-
-_LICENCE = "MIT, as cfx; the recordings that it was trained on are in the public domain"
-_LICENCE_OF_OPENACC = "MIT, as cfx; made with OpenACC's recordings, which are CC BY 4.0"
 
 _SITE_COLUMNS = (
     "scope",
@@ -101,7 +113,7 @@ def publish(name: str, job: Path) -> None:
         shutil.rmtree(folder)
     save_agent(agent, folder / "policy")
     files.write_json(folder / "metrics.json", metrics)
-    card = _card(name, agent, metrics, data)
+    card = _card(name, agent, metrics, data, job)
     if (job / "sites.csv").is_file():
         card["sites"] = _sites(pd.read_csv(job / "sites.csv"))
     card["size_kb"] = _kilobytes(folder)
@@ -141,7 +153,9 @@ def _train(name: str, data: Path, job: Path) -> None:
         raise DataError(f"the job of {name} failed; its words stand above, its log in {job}")
 
 
-def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]) -> dict[str, Any]:
+def _card(
+    name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any], job: Path
+) -> dict[str, Any]:
     """Returns the card: plain data."""
     improvement = "full_trajectory/improvement/rmse_speed/pooled"
     return {
@@ -149,13 +163,14 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
         "summary": RECIPES[name].summary,
         "model": agent.model_node["name"],
         "policy": agent.policy_node["name"],
-        "licence": _LICENCE if RECIPES[name].recordings == (I80,) else _LICENCE_OF_OPENACC,
+        "licence": _licence(RECIPES[name].recordings),
         "command": command_of(name),
         "training_data": {
             "source": _source(RECIPES[name].recordings),
             "pairs": len(agent.trained_on.pairs),
             "drivers": len(set(agent.trained_on.pairs.values())),
             "fingerprint": data.get("fingerprint", ""),
+            "simulated": _simulated(job),
         },
         "evaluation": _evaluation(RECIPES[name].recordings),
         "errors_on_unseen_drivers": {
@@ -189,11 +204,46 @@ def _card(name: str, agent: Agent, metrics: dict[str, Any], data: dict[str, Any]
 
 def _source(recordings: Sequence[str]) -> str:
     """Returns who recorded the files."""
-    found = []
+    sources = []
     for begins, source in _SOURCES.items():
+        places = []
+        for file in recordings:
+            if file.startswith(begins):
+                places += [place for word, place in _PLACES.items() if word in file]
+        if places or any(file.startswith(begins) for file in recordings):
+            sources.append(source.format(", ".join(places)))
+    return "; ".join(sources)
+
+
+def _licence(recordings: Sequence[str]) -> str:
+    """Returns the licence of weights that learned from the files, and theirs."""
+    said = []
+    for begins, words in _LICENCES.items():
         if any(file.startswith(begins) for file in recordings):
-            found.append(source)
-    return "; ".join(found)
+            said.append(words)
+    if not said:
+        return "MIT, as cfx; the recordings that it was trained on are in the public domain"
+    return f"MIT, as cfx; {'; '.join(said)}"
+
+
+def _simulated(job: Path) -> str:
+    """Returns whom a job's networks learned from beside recorded drivers, in words; "" if nobody.
+
+    Args:
+        job: its folder.
+    """
+    learner = OmegaConf.load(job / "config.yaml").learner
+    groups = []
+    if learner.simulated_drivers:
+        groups.append(
+            f"{learner.simulated_drivers} in stop-and-go traffic (Krauss's model and IDM)"
+        )
+    if learner.simulated_queues:
+        groups.append(
+            f"{learner.simulated_queues} who leave queues at lights (IDM, with the saturation flow"
+            " of the Highway Capacity Manual)"
+        )
+    return " and ".join(groups)
 
 
 def _evaluation(recordings: Sequence[str]) -> str:
@@ -331,6 +381,7 @@ def card_text(card: dict[str, Any], measured: dict[str, Any] | None = None) -> s
         f"- **Model and policy**: {card['model']}, {card['policy']}",
         f"- **Training data**: {data['source']};"
         f" {data['pairs']} pairs of {data['drivers']} drivers",
+        *_simulated_lines(data.get("simulated", "")),
         f"- **Evaluation**: {card['evaluation']}",
         f"- **Full trajectories of unseen drivers**: RMSE of speed {errors['rmse_speed']:.3f} m/s"
         f" (pooled parameters: {errors['rmse_speed_pooled']:.3f} m/s), of the gap"
@@ -359,6 +410,10 @@ def card_text(card: dict[str, Any], measured: dict[str, Any] | None = None) -> s
         "",
     ]
     return "\n".join(lines)
+
+
+def _simulated_lines(simulated: str) -> list[str]:
+    return [f"- **Simulated drivers** that it learned from too: {simulated}"] if simulated else []
 
 
 def _purpose_lines(card: dict[str, Any]) -> list[str]:

@@ -5,13 +5,25 @@ from __future__ import annotations
 from typing import NamedTuple
 
 I80 = "i80_reconstructed_pairs.parquet"
-EVERY_ROAD = (
-    I80,
+CARS_WITH_ACC = (
     "openacc_zalazone_pairs.parquet",
     "openacc_vicolungo_pairs.parquet",
     "openacc_ispra_low_speed_pairs.parquet",
 )
-"""Recordings, as they are called in the folder that `make policies` is given."""
+PEOPLE = (
+    I80,
+    "ngsim_i80_hov_ramp_pairs.parquet",
+    "openacc_zalazone_pairs.parquet",
+    "openacc_vicolungo_pairs.parquet",
+    "tgsim_freeway_pairs.parquet",
+)
+EVERY_ROAD = (*PEOPLE, "openacc_ispra_low_speed_pairs.parquet")
+"""Recordings whose licences let weights be published, as they are called in the folder that `make
+policies` is given. Ispra's drivers are cars with ACC, and others of whom nobody knows."""
+
+_HUMAN = "data.driver_type=human"
+"""People and cars with ACC have different equilibria: a policy that learns from both at once ends
+between them."""
 
 _LONG = ("data=tidy", "data.min_duration=30", "protocol.min_test_duration=70")
 _I80 = ("optimizer=random", *_LONG)
@@ -21,15 +33,6 @@ _UNSEEN = ("protocol.history=0.0", "protocol.histories=[]", "protocol.combine=fa
 """Tested as drivers of whom nothing is known. Networks that also learn from drivers with history
 drive unseen ones better than those that learn from cold starts alone."""
 
-
-_ONE_NETWORK = (
-    "protocol.histories=[]",
-    "learner.ensemble_size=1",
-    "learner.drivers=128",
-    "learner.simulated_drivers=0",
-)
-"""One network, of half as many drivers a step, instead of four: an eighth of the time. Simulated
-drivers were tried with four alone."""
 
 _FORECAST = (
     "learner.epochs=16",
@@ -62,19 +65,20 @@ class Recipe(NamedTuple):
 
 RECIPES = {
     "idm": Recipe(
-        ("experiment=every_road", *_UNSEEN),
-        "Intelligent Driver Model for unseen drivers of any road; the one to begin with.",
-        EVERY_ROAD,
+        ("experiment=every_road", _HUMAN, *_UNSEEN),
+        "Intelligent Driver Model for people on any road, unseen; the one to begin with.",
+        PEOPLE,
     ),
     "idm-history": Recipe(
         ("experiment=every_road", "protocol.histories=[]"),
-        "Intelligent Driver Model for drivers with history on any road: it observes a driver, then"
-        " drives as they do, beside their own parameters.",
+        "Intelligent Driver Model for people and cars with adaptive cruise control on any road,"
+        " with history: it observes a driver, then drives as they do, beside their own parameters.",
         EVERY_ROAD,
     ),
     "idm-stochastic": Recipe(
         (
             "experiment=every_road",
+            _HUMAN,
             "protocol=forecast",
             "protocol.samples=20",
             "protocol.stride=5",
@@ -83,38 +87,45 @@ RECIPES = {
             "learner.head=stochastic",
             *_FORECAST,
             "learner.cold_start_fraction=1.0",
-            *_ONE_NETWORK[1:],
         ),
-        "Intelligent Driver Model for unseen drivers of any road who vary as people do: each draws"
-        " their own parameters and noise, with a seed.",
-        EVERY_ROAD,
+        "Intelligent Driver Model for people on any road, unseen, who vary: each draws their own"
+        " parameters and noise, with a seed.",
+        PEOPLE,
     ),
     "idm-acc": Recipe(
         (
             "experiment=every_road",
             "data.driver_type=acc",
-            *_ONE_NETWORK,
+            "protocol.histories=[]",
+            "learner.simulated_queues=0",
         ),
         "Intelligent Driver Model for cars with adaptive cruise control, without history and with.",
-        EVERY_ROAD[1:],
+        CARS_WITH_ACC,
     ),
     "w99": Recipe(
-        ("experiment=every_road", "model=w99_wide", "learner.jerk_weight=0.01", *_ONE_NETWORK),
-        "Wiedemann 99 for drivers of any road, without history and with; Vissim's family.",
-        EVERY_ROAD,
+        (
+            "experiment=every_road",
+            _HUMAN,
+            "model=w99_wide",
+            "learner.jerk_weight=0.01",
+            "protocol.histories=[]",
+        ),
+        "Wiedemann 99 for people on any road, without history and with; Vissim's family.",
+        PEOPLE,
     ),
     "krauss": Recipe(
         (
             "experiment=every_road",
+            _HUMAN,
             "model=krauss",
             "model.parameters.a.tuned=true",
             "model.limits.response_time=0.3",
             "learner.jerk_weight=0.01",
             "protocol.combine=false",
-            *_ONE_NETWORK,
+            "protocol.histories=[]",
         ),
-        "Krauss's model for drivers of any road, without history and with; SUMO's own family.",
-        EVERY_ROAD,
+        "Krauss's model for people on any road, without history and with; SUMO's own family.",
+        PEOPLE,
     ),
     "i80-idm": Recipe(
         ("experiment=unseen_drivers", "model=idm", *_I80),
