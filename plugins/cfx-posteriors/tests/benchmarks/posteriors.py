@@ -158,7 +158,7 @@ def recording(name: str) -> Iterator[str]:
             low = float(found.low[:, column].median())
             high = float(found.high[:, column].median())
             rows.append(f"{parameter} {known:.0%} ({low:.2g} to {high:.2g})")
-        reliable = float((found.pareto_k <= 0.7).double().mean())
+        reliable = float((found.diagnostics["pareto_k"] <= MAX_PARETO_K).double().mean())
         yield (
             f"{type(model).__name__}, {len(batch)} pairs, {seconds or 'all'} s, reliable"
             f" {reliable:.0%}, {spent:.1f} CPU s: {', '.join(rows)}"
