@@ -24,6 +24,7 @@ MODULES = {
     "drawing": "cfx.figures.drawing",
     "engine": "cfx.core.engine",
     "files": "cfx.core.files",
+    "folds": "cfx.evaluation.protocols.folds",
     "forecasts": "cfx.evaluation.forecasts",
     "headline": "cfx.evaluation.headline",
     "identifiability": "cfx.calibration.identifiability",

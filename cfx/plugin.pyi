@@ -196,6 +196,7 @@ from .evaluation.protocols.finished import (
     FoldsOrFinished as FoldsOrFinished,
     FoldsOrFinishedSettings as FoldsOrFinishedSettings,
 )
+from .evaluation.protocols import folds as folds
 from .evaluation.protocols.held_out import HeldOut as HeldOut
 from .evaluation.result import (
     Evaluation as Evaluation,

@@ -243,11 +243,18 @@ def test_the_guides_python_is_the_examples() -> None:
         assert path.read_text(encoding="utf-8") == text, f"copy {head} into docs/plugins.md"
 
 
+def test_the_rival_in_the_guide_is_the_example() -> None:
+    example = blocks("docs/benchmark.md", "python")[0]
+    head, _, text = example.partition("\n")
+    path = ROOT / head.removeprefix("# ")
+    assert path.read_text(encoding="utf-8") == text, f"copy {head} into docs/benchmark.md"
+
+
 def test_the_table_of_kinds_names_what_is_there() -> None:
     text = (ROOT / "docs" / "plugins.md").read_text(encoding="utf-8")
     row = r"^\| (\w+) \| `cfx\.plugin\.(\w+)` \| .* \| (?:`(cfx_contracts\.\w+)`|none) \|$"
     rows = re.findall(row, text, flags=re.MULTILINE)
-    assert {kind for kind, _, _ in rows} == set(registry.every_kind()) - {"section"}
+    assert {kind for kind, _, _ in rows} == set(registry.every_kind()) - {"section", "rival"}
     for kind, base, module in rows:
         cls = getattr(cfx.plugin, base)
         assert f"{cls.__module__}:{base}" == registry.kind_of(kind).base

@@ -136,7 +136,7 @@ def _mean_of_sites(
             row[name] = float(table[name].mean())
     for baseline in BASELINES:
         if f"over_{baseline}" in table:
-            geometric, low, high = geometric_over_sites(
+            geometric, low, high, _ = geometric_over_sites(
                 judged[baseline].to_numpy(),
                 judged["policy"].to_numpy(),
                 about["driver"].tolist(),

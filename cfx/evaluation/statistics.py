@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Against",
+    "OverSites",
+    "geometric_over_sites",
     "improvement_statistics",
     "mean_interval",
     "ranking_of",
@@ -198,9 +200,23 @@ def _t_quantile(freedom: float) -> float:
     return float(stdtrit(freedom, (1.0 + _LEVEL) / 2.0))
 
 
+class OverSites(NamedTuple):
+    """A geometric improvement in which each site counts once.
+
+    Attributes:
+        geometric, ci95_low, ci95_high: as in `Improvement`.
+        p_value: two-sided; below 0.05 exactly where the interval excludes 0.
+    """
+
+    geometric: float
+    ci95_low: float
+    ci95_high: float
+    p_value: float
+
+
 def geometric_over_sites(
     baseline: Floats, errors: Floats, drivers: Sequence[str], sites: Sequence[str]
-) -> tuple[float, float, float]:
+) -> OverSites:
     """Returns the geometric improvement in which each site counts once, and its 95 % interval.
 
     The sites are those at hand, not a sample of all sites: the interval is over the drivers of each
@@ -212,6 +228,8 @@ def geometric_over_sites(
         baseline, errors, drivers: as for `improvement_statistics`.
         sites: the site of each pair, `(P,)`.
     """
+    from scipy.special import stdtr
+
     means, variances, numbers = [], [], []
     of_site, comparable = np.asarray(sites), are_comparable(baseline, errors)
     for site in dict.fromkeys(sites):
@@ -223,22 +241,26 @@ def geometric_over_sites(
         numbers.append(len(logarithms))
         variances.append(float(logarithms.var(ddof=1)) if len(logarithms) > 1 else math.nan)
     if not means:
-        return math.nan, math.nan, math.nan
+        return OverSites(math.nan, math.nan, math.nan, math.nan)
     mean = float(np.mean(means))
     number, variance = np.array(numbers, dtype=float), np.array(variances)
     has_variance = number > 1
     if not has_variance.any():
-        return -math.expm1(mean), math.nan, math.nan
+        return OverSites(-math.expm1(mean), math.nan, math.nan, math.nan)
     freedom = number - 1
     pooled = float((variance * freedom)[has_variance].sum() / freedom[has_variance].sum())
     squares = np.where(has_variance, variance, pooled) / number / len(number) ** 2
     total = float(squares.sum())
     if total == 0.0:
-        return -math.expm1(mean), -math.expm1(mean), -math.expm1(mean)
+        same = -math.expm1(mean)
+        return OverSites(same, same, same, 1.0 if mean == 0.0 else 0.0)
     pooled_freedom = freedom[has_variance].sum()
     degrees = total**2 / float((squares**2 / np.where(has_variance, freedom, pooled_freedom)).sum())
     margin = _t_quantile(degrees) * math.sqrt(total)
-    return -math.expm1(mean), -math.expm1(mean + margin), -math.expm1(mean - margin)
+    p_value = 2.0 * float(stdtr(degrees, -abs(mean) / math.sqrt(total)))
+    return OverSites(
+        -math.expm1(mean), -math.expm1(mean + margin), -math.expm1(mean - margin), p_value
+    )
 
 
 _SIGNIFICANT = 0.05
@@ -278,7 +300,9 @@ class Ranking(NamedTuple):
     apart: tuple[str, ...]
 
 
-def ranking_of(errors: Mapping[str, Sequence[pd.DataFrame]]) -> Ranking:
+def ranking_of(
+    errors: Mapping[str, Sequence[pd.DataFrame]], sites: Mapping[str, str] | None = None
+) -> Ranking:
     """Ranks jobs by their mean error, and compares the best one with each other.
 
     The best is chosen by the errors that then test it, so that the best of many equal jobs would
@@ -292,6 +316,9 @@ def ranking_of(errors: Mapping[str, Sequence[pd.DataFrame]]) -> Ranking:
             (that were simulated) and `error`. A pair's error is the mean over seeds. Jobs are
             compared that simulated the same frames of the same pairs; of several such groups the
             largest counts, of groups of one size the first.
+        sites: the site of each pair, by its id: each site counts once, and jobs are ranked by their
+            geometric mean error, where a site's is that of its drivers. None: all drivers count
+            alike, and jobs are ranked by their mean error over pairs.
     """
     tables = {name: _over_seeds(of_seeds) for name, of_seeds in errors.items()}
     groups: dict[frozenset[tuple[object, object]], list[str]] = {}
@@ -304,12 +331,19 @@ def ranking_of(errors: Mapping[str, Sequence[pd.DataFrame]]) -> Ranking:
     columns = {name: tables[name].set_index("pair_id")["error"] for name in names}
     drivers = tables[names[0]].set_index("pair_id")["driver"].astype(str)
     aligned = {name: column.reindex(drivers.index) for name, column in columns.items()}
-    means = {name: float(column.mean(skipna=False)) for name, column in aligned.items()}
+    of_pair = None if sites is None else [sites[pair_id] for pair_id in drivers.index]
+    means = {}
+    for name, column in aligned.items():
+        means[name] = _mean_error(column, drivers.tolist(), of_pair)
     ranked = sorted(names, key=lambda name: _finite_first(means[name]))
     compared: dict[tuple[str, str], Improvement] = {}
     for better, worse in combinations(ranked, 2):
         before, after = aligned[worse].to_numpy(float), aligned[better].to_numpy(float)
-        compared[better, worse] = improvement_statistics(before, after, drivers.tolist())
+        improvement = improvement_statistics(before, after, drivers.tolist())
+        if of_pair is not None:
+            over_sites = geometric_over_sites(before, after, drivers.tolist(), of_pair)
+            improvement = replace(improvement, **over_sites._asdict())
+        compared[better, worse] = improvement
     p_values = [improvement.p_value for improvement in compared.values()]
     corrected = dict(zip(compared, _holm(p_values), strict=True))
     against = []
@@ -319,6 +353,14 @@ def ranking_of(errors: Mapping[str, Sequence[pd.DataFrame]]) -> Ranking:
     apart = tuple(name for name in errors if name not in ranked)
     mean_errors = tuple(means[name] for name in ranked)
     return Ranking(tuple(ranked), mean_errors, len(tested), tuple(against), apart)
+
+
+def _mean_error(errors: pd.Series, drivers: Sequence[str], sites: Sequence[str] | None) -> float:
+    """Returns the mean error over pairs, or the geometric one in which each site counts once."""
+    values = errors.to_numpy(float)
+    if sites is None:
+        return float(errors.mean(skipna=False))
+    return 1.0 - geometric_over_sites(np.ones_like(values), values, drivers, sites).geometric
 
 
 def _over_seeds(tables: Sequence[pd.DataFrame]) -> pd.DataFrame:

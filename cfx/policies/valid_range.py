@@ -103,10 +103,10 @@ class ValidRange(NamedTuple):
             network: whose range each is compared with, `(D,)`.
         """
         away = situation.to(self.mean) - self.mean[network]
-        # Two at a time: of three PyTorch asks opt_einsum, where that is installed, for an order,
-        # with which an exported graph would keep the number of its drivers.
-        turned = torch.einsum("di,dij->dj", away, self.precision[network])
-        squared = torch.einsum("dj,dj->d", turned, away)
+        # Products of matrices, no einsum: what translates an exported graph to C knows hardly any,
+        # and of three factors opt_einsum, where it is installed, would fix the number of drivers.
+        turned = torch.matmul(away.unsqueeze(-2), self.precision[network]).squeeze(-2)
+        squared = torch.matmul(turned.unsqueeze(-2), away.unsqueeze(-1)).squeeze(-1).squeeze(-1)
         return squared.clamp(min=0.0).sqrt() / self.distance[network]
 
     def beyond(self, situation: Tensor, network: Tensor) -> Tensor:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 EXAMPLE = Path(__file__).parent.parent / "cfx-example"
 TEMPLATES = Path(__file__).parent / "cfx_contracts" / "template"
-WITHOUT_TEMPLATE = {"section"}
+WITHOUT_TEMPLATE = {"section", "rival"}
 """Kinds of other distributions: `cfx plugins new` knows cfx's own."""
 
 

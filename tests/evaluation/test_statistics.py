@@ -116,7 +116,7 @@ def test_each_site_counts_once_however_many_drivers_it_has() -> None:
     logarithms = np.concatenate([rng.normal(-0.2, 0.1, 30), rng.normal(0.1, 0.1, 10)])
     sites = ["A"] * 30 + ["B"] * 10
     drivers = [f"d{k}" for k in range(40)]
-    mean, low, high = geometric_over_sites(np.ones(40), np.exp(logarithms), drivers, sites)
+    mean, low, high, p = geometric_over_sites(np.ones(40), np.exp(logarithms), drivers, sites)
     both = (logarithms[:30].mean() + logarithms[30:].mean()) / 2
     assert mean == pytest.approx(1 - np.exp(both))
     # Welch's test compares two means; the mean of two has half the error of their difference.
@@ -124,9 +124,27 @@ def test_each_site_counts_once_however_many_drivers_it_has() -> None:
     ends = welch.confidence_interval(0.95)
     assert low == pytest.approx(1 - np.exp(ends.high / 2))
     assert high == pytest.approx(1 - np.exp(ends.low / 2))
+    assert p == pytest.approx(welch.pvalue)
     alone = geometric_over_sites(np.ones(2), np.array([0.9, 0.8]), ["a", "b"], ["A", "B"])
     assert alone[0] == pytest.approx(1 - math.sqrt(0.72))
     assert math.isnan(alone[1])
+
+
+def test_a_ranking_over_sites_counts_each_site_once() -> None:
+    """Thirty drivers of one site do not outvote three of each of two others."""
+    rng = np.random.default_rng(5)
+    noise = rng.normal(0.0, 0.02, 36)
+    gain = np.concatenate([np.full(30, -0.1), np.full(6, 0.3)])
+    tables = jobs(np.zeros(36), gain + noise)
+    sites = {f"p{k}": "A" if k < 30 else "BC"[k % 2] for k in range(36)}
+    over_pairs, over_sites = ranking_of(tables), ranking_of(tables, sites)
+    assert over_pairs.jobs == ("job 1", "job 0")
+    assert over_sites.jobs == ("job 0", "job 1")
+    means = [noise[:30].mean() - 0.1]
+    for number in range(2):
+        means.append(0.3 + noise[30 + number :: 2].mean())
+    assert over_sites.errors[1] == pytest.approx(np.exp(np.mean(means)))
+    assert over_sites.against[0].p_value < 1e-4
 
 
 def jobs(*logarithms: np.ndarray) -> dict[str, list[pd.DataFrame]]:

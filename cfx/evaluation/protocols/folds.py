@@ -25,6 +25,9 @@ from cfx.errors import DataError, listed
 
 log = logging.getLogger(__name__)
 
+__all__ = ["Together", "assign_folds"]
+"""What plugins may use, as `cfx.plugin.folds`."""
+
 Together = Literal["driver", "platoon", "vehicle", "recording", "site"]
 """What a fold keeps together."""
 

@@ -51,14 +51,14 @@ def render(runs: Runs, title: str | None = None) -> str:
         body = one.attempt(lambda section: _section(environment, section, runs), "")
         if body.strip():
             sections.append((one.name, one.component, Markup(body)))  # noqa: S704 - a template's
-    scripts = inline_scripts([_asset(name) for name in _SCRIPTS])
+    scripts = inline_scripts([asset(name) for name in _SCRIPTS])
     return environment.get_template("page.html.j2").render(
         title=title or _title(runs.jobs),
         written=f"{datetime.now():%d %B %Y}".lstrip("0"),
         # Nothing of a job's data is in them.
         scripts=[Markup(script) for script in scripts],  # noqa: S704
         security=security_policy(scripts),
-        style=_asset("page.css") + _colours(),
+        style=asset("page.css") + _colours(),
         summary=summary(runs.jobs),
         jobs=len(runs.jobs),
         sections=sections,
@@ -74,9 +74,9 @@ def _environment(runs: Runs) -> Environment:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        loader=jinja2.FunctionLoader(_asset),
+        loader=jinja2.FunctionLoader(asset),
     )
-    environment.filters["placed"] = _placed
+    environment.filters["placed"] = placed
 
     environment.globals |= {
         "drawn": functools.partial(_drawn, environment),
@@ -121,11 +121,12 @@ def _title(jobs: Sequence[Result]) -> str:
     return f"{subject}: {models}"
 
 
-def _asset(name: str) -> str:
+def asset(name: str) -> str:
+    """Returns the text of a template, a style or a script of pages."""
     return (_ASSETS / name).read_text(encoding="utf-8")
 
 
-def _placed(svg: str, place: str) -> Any:
+def placed(svg: str, place: str) -> Any:
     """Returns an `svg` element with ids of its own, at a place of the page."""
     from markupsafe import Markup
 

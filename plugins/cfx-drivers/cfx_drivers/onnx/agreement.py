@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import onnxruntime
@@ -18,8 +19,27 @@ FREE = range(200, 220)
 
 Array = NDArray[np.float64]
 
+Run = Callable[[Mapping[str, Array]], Array]
 
-def largest_difference(step: DriverStep, graph: bytes) -> float:
+
+def in_onnx_runtime(graph: bytes) -> Run:
+    """Returns what runs an ONNX graph.
+
+    Args:
+        graph: the ONNX model.
+    """
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(graph, options)
+
+    def run(given: Mapping[str, Array]) -> Array:
+        speed: Array = session.run(["next_speed"], dict(given))[0]
+        return speed
+
+    return run
+
+
+def largest_difference(step: DriverStep, run: Run) -> float:
     """Returns the largest difference of any speed, m/s.
 
     In each step both get the same: signals, random numbers and what cfx's drivers remember.
@@ -27,11 +47,8 @@ def largest_difference(step: DriverStep, graph: bytes) -> float:
 
     Args:
         step: cfx's own.
-        graph: the ONNX model.
+        run: the exported one: takes all inputs by name and returns the next speeds, `(V,)`.
     """
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(graph, options)
     kept = kept_of(step)
     generator = torch.Generator().manual_seed(0)
     state = step.begin(VEHICLES)
@@ -61,7 +78,7 @@ def largest_difference(step: DriverStep, graph: bytes) -> float:
                 given[name] = value.numpy()
         if step.noise_width:
             given["noise"] = noise.numpy()
-        found = session.run(["next_speed"], given)[0]
+        found = run(given)
         expected, state = _expected(step, state, values, noise)
         difference = float(np.abs(found - expected).max())
         worst = float(np.maximum(worst, difference))  # NaN, if there is one

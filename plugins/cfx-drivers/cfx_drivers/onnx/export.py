@@ -12,7 +12,7 @@ import torch
 
 from cfx.errors import ConfigError, DataError
 from cfx.plugin import ANY_DRIVER, Agent, DriverStep, ExportFormat, files, folder_of, load_agent
-from cfx_drivers.onnx.agreement import largest_difference
+from cfx_drivers.onnx.agreement import in_onnx_runtime, largest_difference
 from cfx_drivers.onnx.card import card
 from cfx_drivers.onnx.graph import graph_of
 
@@ -27,19 +27,12 @@ class OnnxExport(ExportFormat):
     """Writes a policy with its driving model as one ONNX graph, and a card beside it."""
 
     def write(self, run: str, output: Path | None) -> list[str]:
-        source, _, network = run.partition("#")
-        folder = folder_of(source)
-        if output is None:
-            output = (folder if Path(source).expanduser().is_dir() else Path()) / NAME
-        step = DriverStep(_agent(run, folder, network))
+        output = output or default_output(run, NAME)
+        step = step_of(run)
         graph = graph_of(step, run)
         data = graph.SerializeToString()
-        difference = largest_difference(step, data)
-        if not difference <= MOST_DIFFERENCE:
-            raise ConfigError(
-                f"{run}: speeds of its ONNX graph differ from cfx's by {difference:.1g} m/s, so it"
-                " was not written; export another policy, and report this one"
-            )
+        difference = largest_difference(step, in_onnx_runtime(data))
+        check_difference(run, "ONNX graph", difference)
         files.write_output(output, data, "the ONNX file")
         beside = output.with_suffix(".md")
         files.write_output(beside, card(graph, run, len(data), difference), "the card")
@@ -48,6 +41,45 @@ class OnnxExport(ExportFormat):
             f" which speeds differ from cfx's by {difference:.1g} m/s at most",
             f"{beside} says what goes in and out",
         ]
+
+
+def check_difference(run: str, what: str, difference: float) -> None:
+    """Refuses to write a driver that drives otherwise than cfx's.
+
+    Args:
+        run: whose driver it is.
+        what: was exported, in words.
+        difference: of speeds after one step, m/s; NaN where one is not a number.
+
+    Raises:
+        ConfigError: the difference is too large.
+    """
+    if not difference <= MOST_DIFFERENCE:
+        raise ConfigError(
+            f"{run}: speeds of its {what} differ from cfx's by {difference:.1g} m/s, so it was not"
+            " written; export another policy, and report this one"
+        )
+
+
+def default_output(run: str, name: str) -> Path:
+    """Returns where a file of a run is written: into the job's folder, else here."""
+    source = run.partition("#")[0]
+    folder = folder_of(source)
+    return (folder if Path(source).expanduser().is_dir() else Path()) / name
+
+
+def step_of(run: str) -> DriverStep:
+    """Returns the step of a run's drivers.
+
+    Args:
+        run: a job's folder or `cfx://NAME`, with `#NETWORK` behind it where it is not the one for
+            unseen drivers.
+
+    Raises:
+        DataError: there is no policy, or it has no such network.
+    """
+    source, _, network = run.partition("#")
+    return DriverStep(_agent(run, folder_of(source), network))
 
 
 def _agent(run: str, folder: Path, network: str) -> Agent:

@@ -86,22 +86,24 @@ def signals_of(step: DriverStep) -> dict[str, tuple[str, str]]:
     return signals
 
 
-def graph_of(step: DriverStep, run: str) -> onnx.ModelProto:
-    """Returns the graph of a step, for any number of drivers.
+def graph_of(step: DriverStep, run: str, *, one_driver: bool = False) -> onnx.ModelProto:
+    """Returns the graph of a step.
 
     Args:
         step: of the drivers.
         run: where the policy comes from, for the graph's metadata.
+        one_driver: for one driver, all shapes known, instead of for any number.
 
     Raises:
         ConfigError: the policy computes with what ONNX does not have.
     """
     kept = kept_of(step)
-    signals, more = _example(step, kept)
+    signals, more = _example(step, kept, 1 if one_driver else 3)
     inputs = [*signals_of(step), *kept]
     if step.noise_width:
         inputs.append("noise")
     drivers = {0: torch.export.Dim("drivers")}
+    shapes = None if one_driver else ((drivers,) * len(signals), (drivers,) * len(more))
     try:
         with _quiet():
             program = torch.onnx.export(
@@ -111,7 +113,7 @@ def graph_of(step: DriverStep, run: str) -> onnx.ModelProto:
                 opset_version=OPSET,
                 input_names=inputs,
                 output_names=["next_speed", *(f"next_{name}" for name in kept)],
-                dynamic_shapes=((drivers,) * len(signals), (drivers,) * len(more)),
+                dynamic_shapes=shapes,
                 optimize=False,  # its optimizer loses bounds of clamps; runtimes have their own
                 verbose=False,
             )
@@ -128,14 +130,16 @@ def graph_of(step: DriverStep, run: str) -> onnx.ModelProto:
     return model
 
 
-def _example(step: DriverStep, kept: list[str]) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
-    """Returns inputs of three drivers with which the step is traced, each a tensor of its own."""
+def _example(
+    step: DriverStep, kept: list[str], drivers: int
+) -> tuple[tuple[Tensor, ...], tuple[Tensor, ...]]:
+    """Returns inputs with which the step is traced, each a tensor of its own."""
     signals = []
     for number, _ in enumerate(signals_of(step)):
-        signals.append(torch.full((3,), 1.0 + number, dtype=torch.float64))
-    more = [value for name, value in step.begin(3)._asdict().items() if name in kept]
+        signals.append(torch.full((drivers,), 1.0 + number, dtype=torch.float64))
+    more = [value for name, value in step.begin(drivers)._asdict().items() if name in kept]
     if step.noise_width:
-        more.append(torch.zeros((3, step.noise_width), dtype=torch.float64))
+        more.append(torch.zeros((drivers, step.noise_width), dtype=torch.float64))
     return tuple(signals), tuple(more)
 
 

@@ -11,6 +11,10 @@ from cfx.plugin import Improvement, names, statistics
 from cfx_report.benchmark.row import COUNTS
 
 _NEEDED = ("row", "pair_id", "driver")
+_LABELS = {"protocol", "row", "task", "site", "pair_id", "driver", "frames"}
+
+ONLY_TASK = "unseen"
+"""The task of tables that name none."""
 
 
 def read_errors(path: Path) -> pd.DataFrame:
@@ -32,6 +36,8 @@ def read_errors(path: Path) -> pd.DataFrame:
             f"{path}: column {missing[0]} is missing; --against takes the benchmark_pairs.csv that"
             " cfx benchmark writes"
         )
+    if "task" not in table.columns:
+        table["task"] = ONLY_TASK
     return table.assign(pair_id=names.names_of(table["pair_id"]))
 
 
@@ -41,15 +47,15 @@ def compared(
     """Compares errors with those of every row of a table.
 
     Returns:
-        By row and metric: how much smaller my errors are, as a share of theirs, with the interval
-        over drivers and the t test.
+        By row and metric (of several tasks, task and metric): how much smaller my errors are, as a
+        share of theirs, with the interval over drivers and the t test.
 
     Raises:
         DataError: the other pairs or their protocol are not mine.
     """
     found: dict[tuple[str, str], Improvement] = {}
     protocol = mine["protocol"].iloc[0]
-    metrics = [name for name in mine.columns if name not in (*_NEEDED, "protocol", *COUNTS)]
+    tasks = list(mine.groupby("task", sort=False))
     for name, other in others.groupby("row", sort=False):
         theirs = sorted(set(other["protocol"].astype(str)))
         if theirs != [protocol]:
@@ -57,23 +63,36 @@ def compared(
                 f"{source}, row '{name}': is of the protocol {', '.join(theirs)}, this is of"
                 f" {protocol}; errors of different protocols or pairs do not compare"
             )
-        twice = names.named_twice(other["pair_id"].tolist())
-        if twice is not None:
-            raise DataError(f"{source}, row '{name}': pair '{twice}' stands in it twice")
-        both = mine.merge(other, on="pair_id", suffixes=("", "_other"))
-        if len(both) < len(mine) or len(other) != len(mine):
-            raise DataError(
-                f"{source}, row '{name}': has {len(other)} pairs, of which {len(both)} are among my"
-                f" {len(mine)}; the benchmark compares all of them"
-            )
-        for metric in metrics:
-            if f"{metric}_other" not in both:
-                raise DataError(f"{source}, row '{name}': column {metric} is missing")
-            found[str(name), metric] = statistics.improvement_statistics(
-                both[f"{metric}_other"].to_numpy(float),
-                both[metric].to_numpy(float),
-                both["driver"].astype(str).tolist(),
-            )
+        for task, table in tasks:
+            of_task = _compared(table, other[other["task"] == task], f"{source}, row '{name}'")
+            for metric, improvement in of_task.items():
+                label = metric if len(tasks) == 1 else f"{task}/{metric}"
+                found[str(name), label] = improvement
+    return found
+
+
+def _compared(mine: pd.DataFrame, other: pd.DataFrame, source: str) -> dict[str, Improvement]:
+    """Compares the errors of one row in one task."""
+    twice = names.named_twice(other["pair_id"].tolist())
+    if twice is not None:
+        raise DataError(f"{source}: pair '{twice}' stands in it twice")
+    both = mine.merge(other, on="pair_id", suffixes=("", "_other"))
+    if len(both) < len(mine) or len(other) != len(mine):
+        raise DataError(
+            f"{source}: has {len(other)} pairs, of which {len(both)} are among my {len(mine)}; the"
+            " benchmark compares all of them"
+        )
+    found = {}
+    for metric in mine.columns:
+        if metric in _LABELS or metric in COUNTS or mine[metric].isna().all():
+            continue
+        if f"{metric}_other" not in both:
+            raise DataError(f"{source}: column {metric} is missing")
+        found[str(metric)] = statistics.improvement_statistics(
+            both[f"{metric}_other"].to_numpy(float),
+            both[metric].to_numpy(float),
+            both["driver"].astype(str).tolist(),
+        )
     return found
 
 
@@ -84,9 +103,10 @@ def lines_of(found: dict[tuple[str, str], Improvement]) -> list[str]:
         "| --- | --- | --- | --- | --- | --- |",
     ]
     for (row, metric), one in found.items():
-        interval = f"{one.ci95_low:+.1%} to {one.ci95_high:+.1%}"
+        # 0.0 is added so that no difference is +0.0 %, not -0.0 %.
+        interval = f"{one.ci95_low + 0.0:+.1%} to {one.ci95_high + 0.0:+.1%}"
         lines.append(
-            f"| {row} | {metric} | {one.geometric:+.1%} | {interval} |"
+            f"| {row} | {metric} | {one.geometric + 0.0:+.1%} | {interval} |"
             f" {one.win_rate:.0%} of {one.pairs} | {one.p_value:.2g} |"
         )
     return lines

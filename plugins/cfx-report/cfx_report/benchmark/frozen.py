@@ -1,4 +1,4 @@
-"""What the benchmark fixes: pairs, folds, seed, split and metrics, and their hash."""
+"""What the suite `i80` fixes: pairs, folds, seed, split and metrics, and their hash."""
 
 from __future__ import annotations
 

@@ -4,24 +4,25 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 import pandas as pd
 
 from cfx.errors import DataError
-from cfx.plugin import column_of, files, names, statistics
-from cfx_report.benchmark.frozen import METRICS, SCOPE, VERSION, protocol_hash
+from cfx.plugin import files, statistics
+from cfx_report.benchmark.i80 import I80
+from cfx_report.benchmark.score import METRICS
 
-ROW, PAIRS = "benchmark.json", "benchmark_pairs.csv"
-"""What a job of the benchmark leaves beside its own results."""
+ROW, PAIRS, DRIVES = "benchmark.json", "benchmark_pairs.csv", "drives.parquet"
+"""What a row leaves: itself, the errors of each pair, and three drives to be looked at."""
 
 COUNTS = ("collisions", "hard_braking")
 """Metrics that are summed over pairs; of the others the mean counts."""
 
-_DIGITS = 6
-"""Digits after the point in the files that people compare."""
+Value = tuple[float, float | None, float | None]
+"""A value with the ends of its 95 % interval, where it has one."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,11 @@ class Row:
         cfx: version of cfx.
         seconds: that the job took, beside whatever else ran.
         pairs, drivers: that were tested.
-        values: by metric: value, low, high; counts have no interval.
+        values: by metric, or by task and metric: value, low, high; counts have no interval.
+        parts: the seconds that learning (`train`) and driving (`drive`) took.
+        flows: by which share flows behind leaders of constant speed are wrong
+            (`cfx_report.benchmark.equilibrium`), in the mean over folds.
+        card: who, paper, licence and what was learned from, of a submission.
     """
 
     name: str
@@ -47,7 +52,10 @@ class Row:
     seconds: float
     pairs: int
     drivers: int
-    values: Mapping[str, tuple[float, float | None, float | None]]
+    values: Mapping[str, Value]
+    parts: Mapping[str, float] = field(default_factory=dict)
+    flows: Mapping[str, float] = field(default_factory=dict)
+    card: Mapping[str, str] = field(default_factory=dict)
 
     def write(self, path: Path) -> None:
         """Writes the row.
@@ -74,46 +82,30 @@ class Row:
             raise DataError(f"{path}: is no row of the benchmark ({error})") from None
 
 
-def protocol_name(data: str) -> str:
-    """Returns the version and the hash of the protocol on pairs with this fingerprint."""
-    return f"{VERSION}/{protocol_hash(data)}"
+def values_of(errors: pd.DataFrame) -> dict[str, Value]:
+    """Returns each metric of each task: its mean with its 95 % interval over drivers, or its sum.
 
-
-def errors_of(job: Path, row: str, protocol: str, method: str) -> pd.DataFrame:
-    """Returns the errors of a finished job: a row per tested pair.
-
-    Columns: `protocol`, `row`, `pair_id`, `driver`, and the metrics in SI units.
+    Of several sites the mean is over sites, each of which counts once, and has no interval: scores
+    over the baseline have.
 
     Args:
-        job: its folder.
-        row: the row's name.
-        method: whose errors they are, as the job calls it.
-
-    Raises:
-        DataError: the job has none of this method.
+        errors: as `cfx_report.benchmark.score.errors_of` returns them.
     """
-    table = pd.read_csv(job / "pairs.csv")
-    table = table[table["method"] == method]
-    columns = {metric: column_of(metric, SCOPE) for metric in METRICS}
-    if table.empty or not set(columns.values()) <= set(table.columns):
-        raise DataError(f"{job}: has no errors of '{method}' over full trajectories")
-    pair_ids = names.names_of(table["pair_id"])
-    found = pd.DataFrame({"protocol": protocol, "row": row, "pair_id": pair_ids}, table.index)
-    found["driver"] = table["driver"]
-    for metric, column in columns.items():
-        found[metric] = table[column].astype(float).round(_DIGITS)
-    return found.sort_values("pair_id").reset_index(drop=True)
-
-
-def values_of(errors: pd.DataFrame) -> dict[str, tuple[float, float | None, float | None]]:
-    """Returns each metric's mean over pairs with its 95 % interval over drivers, or its sum."""
-    drivers = errors["driver"].astype(str).tolist()
-    values: dict[str, tuple[float, float | None, float | None]] = {}
-    for metric in METRICS:
-        if metric in COUNTS:
-            values[metric] = (float(errors[metric].sum()), None, None)
-        else:
-            values[metric] = statistics.mean_interval(errors[metric].tolist(), drivers)
+    values: dict[str, Value] = {}
+    tasks = list(errors.groupby("task", sort=False))
+    for task, table in tasks:
+        prefix = f"{task}/" if len(tasks) > 1 else ""
+        for metric in METRICS:
+            if not table[metric].notna().any():
+                continue
+            if metric in COUNTS:
+                values[prefix + metric] = (float(table[metric].sum()), None, None)
+            elif len(set(table["site"])) > 1:
+                mean = float(table.groupby("site")[metric].mean().mean())
+                values[prefix + metric] = (mean, None, None)
+            else:
+                drivers = table["driver"].astype(str).tolist()
+                values[prefix + metric] = statistics.mean_interval(table[metric].tolist(), drivers)
     return values
 
 
@@ -129,17 +121,12 @@ def markdown(rows: Sequence[Row]) -> list[str]:
     ]
     for row in sorted(rows, key=lambda one: one.values["rmse_speed"][0]):
         name = row.name
-        if row.protocol != protocol_name_of_frozen():
+        if row.protocol != I80.protocol:
             name += f" (other pairs: {row.data})"
         cells = [name, _cell(row, "rmse_speed", 3), _cell(row, "rmse_gap", 2)]
         cells += [f"{row.values[metric][0]:.0f}" for metric in COUNTS]
         lines.append(f"| {' | '.join(cells)} |")
     return lines
-
-
-def protocol_name_of_frozen() -> str:
-    """Returns the version and the hash of the protocol on the frozen pairs."""
-    return f"{VERSION}/{protocol_hash()}"
 
 
 def _cell(row: Row, metric: str, decimals: int) -> str:

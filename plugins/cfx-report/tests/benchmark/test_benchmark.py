@@ -16,8 +16,8 @@ from cfx.data.tidy import write_tidy
 from cfx.errors import DataError, Terminated
 from cfx_report.benchmark.compare import compared, lines_of, read_errors
 from cfx_report.benchmark.frozen import DATA, METHODS, TESTED, protocol_hash
-from cfx_report.benchmark.row import Row, errors_of, markdown, protocol_name, values_of
-from cfx_report.benchmark.run import overrides_of, row_name, run
+from cfx_report.benchmark.jobs import overrides_of, row_name, run_job
+from cfx_report.benchmark.row import Row, Value, markdown, values_of
 
 
 def dataset(name: str, **settings: object) -> cfx.plugin.PairSet:
@@ -57,7 +57,7 @@ def test_other_pairs_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[s
     write_tidy(dataset("synthetic", pairs=2, frames=320, min_duration=0), path)
     assert main(["benchmark", "model=idm", "--data", str(path)]) == 2
     error = capsys.readouterr().err
-    assert "holds other pairs than the benchmark's" in error
+    assert "holds other pairs than i80-1's" in error
     assert "--other-data" in error
 
 
@@ -65,7 +65,7 @@ def test_data_are_asked_for(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["benchmark", "model=idm"])
     assert ended.value.code == 2
-    assert "--data FILE is needed" in capsys.readouterr().err
+    assert "--data PATH is needed" in capsys.readouterr().err
 
 
 def test_a_model_alone_is_used_with_constant_parameters() -> None:
@@ -79,30 +79,26 @@ def test_a_model_alone_is_used_with_constant_parameters() -> None:
     assert row_name(None, ["model=mine", "tracking.enabled=false"]) == "mine, constant"
 
 
-def made_job(folder: Path, speed: list[float]) -> Path:
-    """A finished job's table: errors of 'policy' as given, of others 9."""
-    rows = []
-    for method in ("default", "policy"):
-        for number, value in enumerate(speed):
-            error = value if method == "policy" else 9.0
-            row = {"pair_id": f"p{number}", "driver": f"d{number // 2}", "method": method}
-            row["full_trajectory_rmse_speed"], row["full_trajectory_rmse_gap"] = error, 4 * error
-            row["full_trajectory_collisions"], row["full_trajectory_hard_braking"] = number, 0
-            rows.append(row)
-    folder.mkdir()
-    pd.DataFrame(rows).to_csv(folder / "pairs.csv", index=False)
-    return folder
-
-
 SPEED = [0.5, 0.6, 0.7, 0.9]
 
 
-def errors(folder: Path, speed: list[float], name: str = "mine", data: str = DATA) -> pd.DataFrame:
-    return errors_of(made_job(folder, speed), name, protocol_name(data), "policy")
+def protocol_name(data: str = DATA) -> str:
+    return f"i80-1/{protocol_hash(data)}"
+
+
+def errors(speed: list[float], name: str = "mine", data: str = DATA) -> pd.DataFrame:
+    """Errors of four pairs of two drivers."""
+    rows = []
+    for number, value in enumerate(speed):
+        row: dict[str, object] = {"protocol": protocol_name(data), "row": name, "task": "unseen"}
+        row |= {"site": "I-80", "pair_id": f"p{number}", "driver": f"d{number // 2}", "frames": 9}
+        row |= {"rmse_speed": value, "rmse_gap": 4 * value, "collisions": number}
+        rows.append(row | {"hard_braking": 0, "crps_speed": np.nan, "coverage": np.nan})
+    return pd.DataFrame(rows)
 
 
 def test_a_row_has_means_with_intervals_over_drivers_and_sums_of_counts(tmp_path: Path) -> None:
-    values = values_of(errors(tmp_path / "job", SPEED))
+    values = values_of(errors(SPEED))
     mean, low, high = values["rmse_speed"]
     assert mean == pytest.approx(np.mean(SPEED))
     assert low is not None
@@ -113,27 +109,20 @@ def test_a_row_has_means_with_intervals_over_drivers_and_sums_of_counts(tmp_path
     assert values["collisions"] == (6.0, None, None)
 
 
-def test_a_method_that_a_job_does_not_have_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="has no errors of 'pooled'"):
-        errors_of(made_job(tmp_path / "job", SPEED), "mine", "p", "pooled")
-
-
-def row(
-    name: str, values: dict[str, tuple[float, float | None, float | None]], data: str = DATA
-) -> Row:
+def row(name: str, values: dict[str, Value], data: str = DATA) -> Row:
     return Row(name, protocol_name(data), "some pairs", "cfx benchmark", "0.1", 1.0, 4, 2, values)
 
 
 def test_rows_are_sorted_and_those_of_other_pairs_are_marked(tmp_path: Path) -> None:
-    worse = row("a", values_of(errors(tmp_path / "a", [1.0] * 4)))
-    better = row("b", values_of(errors(tmp_path / "b", SPEED)), data="others")
+    worse = row("a", values_of(errors([1.0] * 4)))
+    better = row("b", values_of(errors(SPEED)), data="others")
     lines = markdown([worse, better])
     assert lines[2].startswith("| b (other pairs: some pairs) | 0.675 (")
     assert lines[3].startswith("| a | 1.000 (1.000 to 1.000) | 4.00 (4.00 to 4.00) | 6 | 0 |")
 
 
 def test_a_row_reads_back(tmp_path: Path) -> None:
-    one = row("a", values_of(errors(tmp_path / "job", SPEED)))
+    one = row("a", values_of(errors(SPEED)))
     one.write(tmp_path / "row.json")
     assert json.loads(json.dumps(Row.read(tmp_path / "row.json").__dict__)) == json.loads(
         json.dumps(one.__dict__)
@@ -144,8 +133,8 @@ def test_a_row_reads_back(tmp_path: Path) -> None:
 
 
 def test_a_comparison_is_pair_by_pair(tmp_path: Path) -> None:
-    mine = errors(tmp_path / "mine", SPEED)
-    theirs = errors(tmp_path / "other", [2 * value for value in SPEED], "other")
+    mine = errors(SPEED)
+    theirs = errors([2 * value for value in SPEED], "other")
     found = compared(mine, theirs.sample(frac=1.0, random_state=1), "other.csv")
     assert set(found) == {("other", "rmse_speed"), ("other", "rmse_gap")}
     one = found["other", "rmse_speed"]
@@ -158,8 +147,8 @@ def test_a_comparison_is_pair_by_pair(tmp_path: Path) -> None:
 
 
 def test_what_does_not_compare_is_refused(tmp_path: Path) -> None:
-    mine = errors(tmp_path / "mine", SPEED)
-    other_data = errors(tmp_path / "b", SPEED, data="other pairs")
+    mine = errors(SPEED)
+    other_data = errors(SPEED, data="other pairs")
     with pytest.raises(DataError, match="errors of different protocols or pairs do not compare"):
         compared(mine, other_data, "b.csv")
     with pytest.raises(DataError, match="has 3 pairs, of which 3 are among my 4"):
@@ -201,9 +190,6 @@ def test_a_job_that_was_broken_off_has_not_failed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int, error: type[BaseException]
 ) -> None:
     """The exit code is that of the signal, and the same command goes on."""
-    path = tmp_path / "p.parquet"
-    write_tidy(dataset("synthetic", pairs=2, frames=320, min_duration=0), path)
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("cfx.app.cli.main", lambda _: code)
     with pytest.raises(error):
-        run(["model=idm"], path, None, name="mine", other_data=True)
+        run_job(["model=idm"], tmp_path / "job")

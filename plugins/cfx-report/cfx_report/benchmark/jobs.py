@@ -1,20 +1,16 @@
-"""Runs the benchmark's job and writes its row."""
+"""The jobs of cfx's own methods: which overrides are free, and running one that goes on."""
 
 from __future__ import annotations
 
 import json
 import re
-import shlex
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import cast
 
-import cfx
 from cfx.errors import ConfigError, DataError, Terminated, nearest
 from cfx.plugin import files
-from cfx_report.benchmark.frozen import DATA, DATA_NAME, FROZEN_KEYS, METHODS, OVERRIDES
-from cfx_report.benchmark.row import PAIRS, ROW, Row, errors_of, protocol_name, values_of
+from cfx_report.benchmark.frozen import FROZEN_KEYS, METHODS
 
 _CHANGE_NOTHING = (
     "tracking",
@@ -31,59 +27,6 @@ _CHANGE_NOTHING = (
 
 _SECONDS = "benchmark_seconds.txt"
 """How long the job took, kept with it."""
-
-
-def run(
-    overrides: Sequence[str], data: Path, folder: Path | None, *, name: str, other_data: bool
-) -> tuple[Row, Path]:
-    """Runs one job under the frozen protocol and writes its row; a finished job is not run again.
-
-    Args:
-        overrides: of the job: its model, policy, learner and what else is a method's own.
-        data: the recordings.
-        folder: the job's; None: `outputs/benchmark/NAME`.
-        name: of the row.
-        other_data: whether pairs other than the frozen ones are allowed.
-
-    Returns:
-        The row and the job's folder.
-
-    Raises:
-        ConfigError: an override changes what is frozen.
-        DataError: the pairs are not the frozen ones, or the job failed.
-    """
-    _require_free(overrides)
-    fingerprint = _fingerprint(data)
-    if fingerprint != DATA and not other_data:
-        raise DataError(
-            f"{data}: holds other pairs than the benchmark's ({DATA_NAME}): their fingerprint is"
-            f" {fingerprint[:12]} instead of {DATA[:12]}. Errors on other pairs do not compare;"
-            " with --other-data the row is made and marked"
-        )
-    about = DATA_NAME
-    if fingerprint != DATA:
-        about = f"{data.name}, {fingerprint[:12]}"
-    job = folder or Path("outputs/benchmark") / _as_file_name(name)
-    command = [*overrides, *OVERRIDES, files.path_override("data.path", data)]
-    protocol = protocol_name(fingerprint)
-    print(f"Benchmark {protocol}, row '{name}'; the job's folder: {job}", flush=True)
-    _run_job(command, job)
-    errors = errors_of(job, name, protocol, _method(job))
-    row = Row(
-        name=name,
-        protocol=protocol,
-        data=about,
-        command=f"cfx benchmark {shlex.join(_of_method(overrides))}",
-        cfx=str(json.loads((job / "data.json").read_text(encoding="utf-8"))["cfx"]),
-        seconds=float((job / _SECONDS).read_text(encoding="utf-8")),
-        pairs=len(errors),
-        drivers=errors["driver"].nunique(),
-        values=values_of(errors),
-    )
-    with files.atomic_write(job / PAIRS) as temporary:
-        errors.to_csv(temporary, index=False)
-    row.write(job / ROW)
-    return row, job
 
 
 def overrides_of(method: str | None, given: Sequence[str]) -> list[str]:
@@ -108,7 +51,7 @@ def overrides_of(method: str | None, given: Sequence[str]) -> list[str]:
 def row_name(method: str | None, given: Sequence[str]) -> str:
     """Returns what a row is called where its user gives it no name."""
     words = []
-    for one in _of_method(given):
+    for one in of_method(given):
         key, _, value = one.partition("=")
         if key in {"model", "policy", "learner", "experiment"}:
             words.append(value)
@@ -121,7 +64,7 @@ def row_name(method: str | None, given: Sequence[str]) -> str:
     return ", ".join(words)
 
 
-def _of_method(overrides: Sequence[str]) -> list[str]:
+def of_method(overrides: Sequence[str]) -> list[str]:
     """Returns the overrides without those that change no result."""
     kept = []
     for one in overrides:
@@ -130,7 +73,7 @@ def _of_method(overrides: Sequence[str]) -> list[str]:
     return kept
 
 
-def _require_free(overrides: Sequence[str]) -> None:
+def require_free(overrides: Sequence[str]) -> None:
     """Raises ConfigError for an override of what is frozen."""
     for one in overrides:
         key = one.partition("=")[0].lstrip("+~")
@@ -141,14 +84,7 @@ def _require_free(overrides: Sequence[str]) -> None:
             )
 
 
-def _fingerprint(data: Path) -> str:
-    """Returns the fingerprint of the pairs that the benchmark takes of a file."""
-    cls = cfx.get("dataset", "tidy")
-    dataset = cast(cfx.plugin.Dataset, cls(path=data, min_duration=30))
-    return dataset.load().fingerprint
-
-
-def _run_job(command: Sequence[str], job: Path) -> None:
+def run_job(command: Sequence[str], job: Path) -> None:
     """Runs a job, unless the same one is finished there.
 
     Raises:
@@ -159,7 +95,6 @@ def _run_job(command: Sequence[str], job: Path) -> None:
     record = job / "benchmark_command.json"
     if (job / "metrics.json").is_file() and (job / _SECONDS).is_file():
         if json.loads(record.read_text(encoding="utf-8")) == list(command):
-            print(f"{job}: was finished before")
             return
         raise ConfigError(f"{job}: holds another job; give --output another folder, or --name")
     from cfx.plugin import main
@@ -177,11 +112,6 @@ def _run_job(command: Sequence[str], job: Path) -> None:
     (job / _SECONDS).write_text(f"{time.monotonic() - began:.1f}", encoding="utf-8")
 
 
-def _method(job: Path) -> str:
-    """Returns whose errors count: the policy's, or those of pooled constant parameters."""
-    about = json.loads((job / "data.json").read_text(encoding="utf-8"))
-    return "pooled" if about["purpose"] == "calibration" else "policy"
-
-
-def _as_file_name(name: str) -> str:
+def as_file_name(name: str) -> str:
+    """Returns what a row's folder is called."""
     return re.sub(r"[^A-Za-z0-9._=-]+", "-", name).strip("-")

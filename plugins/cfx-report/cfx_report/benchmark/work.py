@@ -1,0 +1,265 @@
+"""Makes a row: fold after fold an entry learns and drives, and what it drove is scored.
+
+Every fold is a file when it is done, so that a row that was broken off goes on. Errors are those of
+the files of trajectories and forecasts that the row leaves: anybody's files are scored alike.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+import cfx
+from cfx.errors import ConfigError
+from cfx.plugin import PairSet, files
+from cfx_report.benchmark import predictions
+from cfx_report.benchmark.equilibrium import flow_errors
+from cfx_report.benchmark.methods import Entry, Training
+from cfx_report.benchmark.rival import Driver
+from cfx_report.benchmark.row import DRIVES, PAIRS, ROW, Row, values_of
+from cfx_report.benchmark.score import errors_of
+from cfx_report.benchmark.segments import segments_of
+from cfx_report.benchmark.suite import Suite, Task
+
+_COMMAND = "benchmark_command.json"
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """What a suite has read.
+
+    Attributes:
+        suite: whose pairs they are.
+        pairs: all that are learned from or tested.
+        source: the folder or file.
+        protocol: version and hash, on these pairs.
+    """
+
+    suite: Suite
+    pairs: PairSet
+    source: Path
+    protocol: str
+
+    @classmethod
+    def read(cls, suite: Suite, source: Path, *, other_data: bool) -> Recordings:
+        """Reads them.
+
+        Raises:
+            DataError: a file is missing or holds other pairs.
+        """
+        pairs = suite.load(source, other_data=other_data)
+        return cls(suite, pairs, source, suite.protocol_of(pairs.fingerprint))
+
+    @property
+    def about(self) -> str:
+        """What the pairs are."""
+        if self.protocol == self.suite.protocol:
+            return self.suite.about
+        return f"{self.source.name}, {self.pairs.fingerprint[:12]}"
+
+    def file_for_jobs(self, folder: Path) -> Path:
+        """Returns a file of the pairs: the user's own, or one that is written."""
+        if len(self.suite.files) == 1:
+            return self.suite.paths(self.source)[0]
+        path = folder / f"{self.protocol.replace('/', '-')}.parquet"
+        if not path.is_file():
+            folder.mkdir(parents=True, exist_ok=True)
+            cfx.Pairs(self.pairs).save(path)
+        return path
+
+
+def command_of(suite: Suite, words: Sequence[str]) -> str:
+    """Returns the command line that gives a row again, without its data."""
+    chosen = "" if suite.name == "i80" else f" --suite {suite.name}"
+    return f"cfx benchmark{chosen} {shlex.join(words)}"
+
+
+def make_row(entry: Entry, recordings: Recordings, folder: Path, seed: int) -> Row:
+    """Trains and tests an entry, or takes what was finished before, and writes its row.
+
+    Args:
+        entry: a model, a policy or a rival.
+        recordings: of the suite.
+        folder: of the row.
+        seed: of training.
+
+    Raises:
+        ConfigError: the folder holds another row.
+        DataError: a job failed.
+    """
+    suite = recordings.suite
+    _claim(folder, [*entry.words, f"seed={seed}", recordings.protocol])
+    if (folder / ROW).is_file():
+        print(f"{folder}: was finished before", flush=True)
+    recording = recordings.file_for_jobs(folder.parent)
+    timings = []
+    for scheme in suite.schemes:
+        fold = suite.folds_of(recordings.pairs, scheme, seed)
+        training = Training(suite, scheme, recordings.pairs, fold, recording, folder, seed)
+        for number in range(training.folds):
+            timings.append(_fold(entry, training, number))
+    _join(folder)
+    made = pd.DataFrame([timing["seconds"] for timing in timings]).sum()
+    flow = pd.DataFrame([timing["flows"] for timing in timings]).mean()
+    return write_row(
+        recordings,
+        folder,
+        name=entry.name,
+        command=command_of(suite, entry.words),
+        seconds={str(name): float(value) for name, value in made.items()},
+        flows={str(name): float(value) for name, value in flow.items()},
+    )
+
+
+def write_row(
+    recordings: Recordings,
+    folder: Path,
+    *,
+    name: str,
+    command: str,
+    seconds: dict[str, float],
+    flows: dict[str, float],
+    card: dict[str, str] | None = None,
+) -> Row:
+    """Scores the predictions that lie in a folder, and writes its row."""
+    suite, tested = recordings.suite, recordings.suite.tested(recordings.pairs)
+    parts, drives = [], None
+    for file in (predictions.TRAJECTORIES, predictions.FORECASTS):
+        if (folder / file).is_file():
+            table = predictions.read(folder / file)
+            parts.append(errors_of(suite, tested, table, str(folder / file)))
+            if file == predictions.TRAJECTORIES:
+                drives = _drives(suite, tested, table, parts[-1])
+    errors = pd.concat(parts, ignore_index=True)
+    if drives is not None:
+        predictions.write(drives, folder / DRIVES)
+    errors.insert(0, "protocol", recordings.protocol)
+    errors.insert(1, "row", name)
+    row = Row(
+        name=name,
+        protocol=recordings.protocol,
+        data=recordings.about,
+        command=command,
+        cfx=cfx.__version__,
+        seconds=sum(seconds.values()),
+        pairs=errors["pair_id"].nunique(),
+        drivers=errors["driver"].nunique(),
+        values=values_of(errors),
+        parts=seconds,
+        flows=flows,
+        card=card or {},
+    )
+    with files.atomic_write(folder / PAIRS) as temporary:
+        errors.to_csv(temporary, index=False)
+    row.write(folder / ROW)
+    return row
+
+
+_SHOWN = {"best": 0.0, "median": 0.5, "worst": 1.0}
+"""Pairs that a page shows of each row, by the rank of their error in the first task."""
+
+
+def _drives(
+    suite: Suite, pairs: PairSet, table: pd.DataFrame, errors: pd.DataFrame
+) -> pd.DataFrame:
+    """Returns what three pairs of the first task drove beside the recording.
+
+    Columns: drive, site, rmse_speed (m/s), time_s, leader, recorded, driven (m/s).
+    """
+    answered = set(errors["task"])
+    task = next(task.name for task in suite.tasks if task.name in answered)
+    ranked = errors[errors["task"] == task].sort_values("rmse_speed", ignore_index=True)
+    by_id = {pair.pair_id: pair for pair in pairs}
+    parts = []
+    for drive, rank in _SHOWN.items():
+        about = ranked.iloc[round(rank * (len(ranked) - 1))]
+        rows = table[(table["task"] == task) & (table["pair_id"] == about["pair_id"])]
+        pair = by_id[about["pair_id"]]
+        frame = np.rint(rows["time_s"].to_numpy() / pair.dt).astype(np.int64)
+        columns = {
+            "drive": drive,
+            "site": about["site"],
+            "rmse_speed": about["rmse_speed"],
+            "time_s": rows["time_s"],
+            "leader": np.asarray(pair.leader_speed)[frame],
+            "recorded": np.asarray(pair.follower_speed)[frame],
+            "driven": rows["speed_mps"],
+        }
+        parts.append(pd.DataFrame(columns))
+    return pd.concat(parts, ignore_index=True)
+
+
+def _claim(folder: Path, command: Sequence[str]) -> None:
+    """Keeps a folder for one row.
+
+    Raises:
+        ConfigError: it holds another one.
+    """
+    record = folder / _COMMAND
+    if record.is_file():
+        if json.loads(record.read_text(encoding="utf-8")) != list(command):
+            raise ConfigError(f"{folder}: holds another row; give --output another folder")
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    files.write_output(record, json.dumps(list(command)), "the row's command")
+
+
+def _fold(entry: Entry, training: Training, number: int) -> dict[str, dict[str, float]]:
+    """Lets an entry learn and drive in one fold, unless that is done; returns times and flows."""
+    place = training.folder / "folds" / f"{training.scheme.name}-{number}"
+    done = place / "done.json"
+    if not done.is_file():
+        place.mkdir(parents=True, exist_ok=True)
+        began = time.monotonic()
+        driver = entry.driver(training, number)
+        trained = time.monotonic()
+        for task in training.suite.tasks_of(training.scheme):
+            _drive(driver, training, number, task, place)
+        driven = time.monotonic()
+        flows = flow_errors(driver, training.pairs.dt)
+        print(
+            f"{training.scheme.name}, fold {number + 1} of {training.folds}: learned in"
+            f" {trained - began:.0f} s, drove in {driven - trained:.0f} s",
+            flush=True,
+        )
+        seconds = {"train": trained - began, "drive": driven - trained}
+        files.write_json(done, {"seconds": seconds, "flows": flows})
+    found: dict[str, dict[str, float]] = json.loads(done.read_text(encoding="utf-8"))
+    return found
+
+
+def _drive(driver: Driver, training: Training, number: int, task: Task, place: Path) -> None:
+    """Lets a driver answer a task in a fold, and writes what it drove."""
+    suite, seed = training.suite, training.seed
+    segments = segments_of(suite, task, list(training.tested(number)))
+    if not len(segments):
+        return
+    batch = segments.blanked()
+    if task.kind == "forecast":
+        speed = driver.forecast(batch, segments.first, seed, suite.samples)
+        table = predictions.forecast_table(segments, speed, suite.horizons)
+    else:
+        if task.kind == "last_part":
+            driver = driver.adapted(segments.past, seed)
+        table = predictions.trajectory_table(
+            task.name, segments, driver.drive(batch, segments.first, None)
+        )
+    predictions.write(table, place / f"{task.name}.parquet")
+
+
+def _join(folder: Path) -> None:
+    """Writes the trajectories and the forecasts of all folds as one file each."""
+    parts: dict[str, list[pd.DataFrame]] = {}
+    for path in sorted((folder / "folds").glob("*/*.parquet")):
+        table = pd.read_parquet(path)
+        name = predictions.FORECASTS if "horizon_s" in table else predictions.TRAJECTORIES
+        parts.setdefault(name, []).append(table)
+    for name, tables in parts.items():
+        predictions.write(pd.concat(tables, ignore_index=True), folder / name)
