@@ -124,7 +124,7 @@ def likely_starts(posterior: Posterior, seed: int) -> Tensor:
     """Returns the likeliest of some places all over the prior, `(P, S, s)`.
 
     A density may have several modes: a search from one place alone ends at the wrong one for 5 % of
-    synthetic IDM drivers, with these for 1 or 2 in 100 drawn ones. The places are a Latin hypercube.
+    synthetic IDM drivers, with these for less than 2 of 100. The places are a Latin hypercube.
 
     Args:
         posterior: of P drivers.
