@@ -10,7 +10,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
-from cfx.api.pairs import Pairs, PairsLike, pairs_from
+from cfx.api.pairs import Pairs, PairsLike, pairs_from, without_data
 from cfx.app.job.run import compute
 from cfx.app.overrides import IN_MEMORY, command_of, config_of
 from cfx.core import registry
@@ -86,7 +86,8 @@ def config(pairs: PairsLike | None = None, /, **settings: Any) -> Experiment:
     Args:
         pairs: what it runs on, as `cfx.read` takes it; None: what `data` says.
         settings: as on the command line: the components (`model="w99"`, `experiment="adaptive"`)
-            and settings (`seed=1`); those within a component as `**{"learner.epochs": 20}`.
+            and settings (`seed=1`); those within a component as `**{"learner.epochs": 20}`, those
+            of reading a file as `**{"data.max_pairs": 20}`.
 
     Raises:
         CfxError: a name or a value is wrong, in one sentence.
@@ -98,10 +99,10 @@ def config(pairs: PairsLike | None = None, /, **settings: Any) -> Experiment:
         'python -m cfx model=krauss policy=fixed seed=3'
     """
     with visit():
-        found = config_of(settings)
         if pairs is None:
-            return Experiment(found)
-        recording = pairs_from(pairs)
+            return Experiment(config_of(settings))
+        recording = pairs_from(pairs, settings)
+        found = config_of(without_data(settings))
         node = {"data": dict(recording.node)}
         return Experiment(JobConfig.of({**found.model_dump(), **node}), recording)
 
@@ -161,7 +162,9 @@ def train(
         >>> result.improvement(over="pooled").index[0]
         'geometric'
     """
-    return config(pairs_from(pairs), experiment=for_, model=model, seed=seed, **settings).run()
+    refuse_unused(settings, {**NOTHING_KEPT, "experiment": "give it as for_=NAME"})
+    recording, others = pairs_from(pairs, settings), without_data(settings)
+    return config(recording, experiment=for_, model=model, seed=seed, **others).run()
 
 
 def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings: Any) -> Result:
@@ -193,20 +196,48 @@ def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings:
     """
     with in_folder(policy) as folder:
         chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
-        return config(pairs_from(pairs), **chosen).run()
+        return config(pairs_from(pairs, settings), **without_data(chosen)).run()
+
+
+NOTHING_KEPT = {
+    "cache": "calibrations are kept by jobs alone",
+    "tracking": "MLflow is told of jobs alone",
+    "output": "nothing is written or printed",
+    "hydra": "nothing is written, and no jobs are started",
+    "failed_value": "it is what a multirun is told",
+    "demo": "it is what a job on the command line shows",
+}
+"""Settings that do nothing in a call of Python, and why."""
+
+
+def refuse_unused(settings: Mapping[str, Any], unused: Mapping[str, str]) -> None:
+    """Refuses settings of a call that would do nothing.
+
+    Args:
+        settings: of the call.
+        unused: groups and settings, and why they do nothing.
+
+    Raises:
+        ConfigError: one of them is given.
+    """
+    for key, value in settings.items():
+        reason = unused.get(key) or unused.get(key.partition(".")[0])
+        if reason is not None:
+            raise ConfigError(f"{key}={value} does nothing here: {reason}; leave it out")
 
 
 def settings_of(settings: Mapping[str, Any], folder: str) -> dict[str, Any]:
     """Returns the settings of a call that tests the policy in a folder.
 
     Raises:
-        ConfigError: one of them is the policy's own.
+        ConfigError: one of them is the policy's own, or does nothing.
     """
     for key in settings:
         if key.partition(".")[0] in {"model", "policy", "windows"}:
             raise ConfigError(
                 f"{key}: the policy brings its model, its network and its windows; leave it out"
             )
+    refuse_unused(settings, {**NOTHING_KEPT, "learner": "the policy has been trained already"})
     return {**settings, "protocol.run": folder}
 
 

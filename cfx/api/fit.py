@@ -14,9 +14,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pandas as pd
 
-from cfx.api.experiment import Experiment, config
-from cfx.api.pairs import PairIds, Pairs, PairsLike, chosen_names, pairs_from, read
-from cfx.calibration.settings import APART
+from cfx.api.experiment import NOTHING_KEPT, Experiment, config, refuse_unused
+from cfx.api.pairs import (
+    PairIds,
+    Pairs,
+    PairsLike,
+    chosen_names,
+    pairs_from,
+    read,
+    without_data,
+)
+from cfx.calibration.settings import APART, doubts
 from cfx.core.files import atomic_write
 from cfx.core.guest import visit
 from cfx.data.tidy import write_tidy
@@ -29,6 +37,7 @@ if TYPE_CHECKING:
     import torch
     from matplotlib.figure import Figure
     from torch import Tensor
+    from xarray import DataTree
 
     from cfx.app.job.steps import JobComponents
     from cfx.calibration.posterior import DriverPosteriors
@@ -151,14 +160,17 @@ class Fit:
     def intervals(self) -> pd.DataFrame:
         """What each recording says of its driver's parameters: 90 % intervals, a row per pair.
 
-        Columns are those of `fits.parquet`: `low_NAME`, `median_NAME`, `high_NAME` (SI units),
-        `contraction_NAME` (0: the recording says nothing, 1: all) and the noise's; `pareto_k` above
-        0.7 (of `nuts`: `r_hat` above 1.05) says that a row is not to be relied on.
+        `doubt` says why a row is not to be taken at its word; it is empty where nothing is known
+        against it. The other columns are those of `fits.parquet`: `low_NAME`, `median_NAME`,
+        `high_NAME` (SI units), `contraction_NAME` (0: the recording says nothing, 1: all), `noise`
+        (where it enters), `held` (which share of the held-out part forecasts hold; 0.9 is right)
+        and diagnostics.
 
         Raises:
             ConfigError: no posterior was asked for.
         """
-        return pd.DataFrame(self._posterior.columns(), self.parameters.index)
+        rows = pd.DataFrame(self._posterior.columns(), self.parameters.index)
+        return rows.assign(doubt=doubts(rows))
 
     @cached_property
     def draws(self) -> pd.DataFrame:
@@ -172,6 +184,19 @@ class Fit:
             [self.parameters.index, range(found.shape[1])], names=["pair_id", "draw"]
         )
         return pd.DataFrame(found.flatten(0, 1).numpy(), rows, self.parameters.columns)
+
+    def inference_data(self) -> DataTree:
+        """Returns the draws as ArviZ reads them: its InferenceData, an `xarray.DataTree`.
+
+        Groups: `posterior` with dimensions chain, draw and pair; `prior`, or `population`;
+        `diagnostics` of each pair. It is what `cfx export JOB --to netcdf` writes of a job.
+
+        Raises:
+            ConfigError: no posterior was asked for, or it has no draws that ArviZ knows.
+        """
+        with visit():
+            model = self._context.stepper.model
+            return self._posterior.inference_data(list(self.parameters.index), model)
 
     def draw(self, drivers: int, *, seed: int = 0) -> pd.DataFrame:
         """Draws new drivers from the population of these: parameters as correlated as theirs.
@@ -362,7 +387,15 @@ class Fit:
 
 def _ask_for(posterior: str) -> str:
     """Returns how a calibration asks for a posterior."""
-    return f"say cfx.calibrate(..., **{{'calibration.posterior': '{posterior}'}})"
+    return f"say cfx.calibrate(..., posterior='{posterior}')"
+
+
+_NOT_TRAINED = {
+    "policy": "parameters are calibrated, no policy is trained",
+    "learner": "parameters are calibrated, no policy is trained",
+    "protocol": "each driver is calibrated on the first part of their trajectory",
+}
+"""Settings that do nothing in a calibration, and why."""
 
 
 def calibrate(
@@ -370,6 +403,7 @@ def calibrate(
     model: str = "idm",
     *,
     objective: str = "speed_rmse",
+    posterior: str = "none",
     seed: int = 0,
     **settings: Any,
 ) -> Fit:
@@ -383,10 +417,13 @@ def calibrate(
         pairs: as `cfx.read` takes them.
         model: as after `model=`.
         objective: what is minimised, as after `objective=`: `speed_rmse`, `gap_rmse`, ...
+        posterior: how well each parameter is known, as after `calibration.posterior=`. With
+            `laplace` (the quickest), `nuts` or `sbi` the fit has `intervals`, `draws` and
+            `inference_data`, with `hierarchical` new drivers too (`draw`). They are found when they
+            are first asked for.
         seed: the same seed gives the same parameters.
         settings: others of the command line: `optimizer="botorch"`, `split=0.7`,
-            `**{"model.parameters.T.high": 4.0}`. With `**{"calibration.posterior": "laplace"}`
-            the fit has `intervals` and `draws`, with `"hierarchical"` new drivers too (`draw`).
+            `**{"model.parameters.T.high": 4.0}`; of reading a file, `**{"data.max_pairs": 20}`.
 
     Raises:
         CfxError: the pairs or a setting are wrong, in one sentence.
@@ -400,8 +437,13 @@ def calibrate(
         >>> bool((fit.losses["test_rmse_gap"] >= 0).all())
         True
     """
-    chosen = {"model": model, "objective": objective, "seed": seed, **settings}
-    recording = pairs_from(pairs)
+    refuse_unused(settings, {**NOTHING_KEPT, **_NOT_TRAINED})
+    if posterior != "none":
+        if "calibration.posterior" in settings:
+            raise ConfigError("give posterior=... or calibration.posterior, not both")
+        settings["calibration.posterior"] = posterior
+    chosen = {"model": model, "objective": objective, "seed": seed, **without_data(settings)}
+    recording = pairs_from(pairs, settings)
     experiment = config(recording, policy="fixed", protocol="within_driver", **chosen)
     with visit():
         components, context, last = _context_of(experiment, recording)

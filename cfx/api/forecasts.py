@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 
 from cfx.api.experiment import PolicyLike, config, in_folder, settings_of
-from cfx.api.pairs import PairIds, PairsLike, chosen_names, pairs_from
+from cfx.api.pairs import PairIds, PairsLike, chosen_names, pairs_from, without_data
 from cfx.core.guest import visit
 from cfx.errors import ConfigError
 from cfx.policies.known_drivers import base_of
@@ -125,9 +125,9 @@ def forecast(
     from cfx.evaluation.forecasts import sample_from_origins
 
     with in_folder(policy) as folder, visit():
-        recording = pairs_from(pairs)
+        recording = pairs_from(pairs, settings)
         chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
-        experiment = config(recording, **chosen)
+        experiment = config(recording, **without_data(chosen))
         _, components, context = steps.without_files(experiment.config, recording.selected)
         finished = cast(Any, components.protocol).finished
         finished.check(context.pairs)

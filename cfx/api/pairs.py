@@ -262,10 +262,36 @@ def _paths(source: Any) -> list[str | Path]:
     return found
 
 
-def pairs_from(given: PairsLike) -> Pairs:
-    """Returns pairs of whatever `cfx.read` takes."""
-    if isinstance(given, Pairs):
+def pairs_from(given: PairsLike, settings: Mapping[str, Any] | None = None) -> Pairs:
+    """Returns pairs of whatever `cfx.read` takes.
+
+    Args:
+        given: a file or a table is read, pairs that have been read are returned.
+        settings: of a call; those of `data` say how a file or a table is read.
+
+    Raises:
+        ConfigError: the pairs have been read already, so that a setting of `data` does nothing.
+    """
+    of_data = {key: value for key, value in (settings or {}).items() if _is_of_data(key)}
+    if isinstance(given, Pairs | PairSet):
+        if of_data:
+            key, value = next(iter(of_data.items()))
+            raise ConfigError(
+                f"{key}={value}: these pairs have been read already, so it does nothing; say it"
+                f" where they are read: cfx.read(..., {key.partition('.')[2] or 'dataset'}=...)"
+            )
+        if isinstance(given, PairSet):
+            return Pairs(given, {"name": "tidy", "path": IN_MEMORY})
         return given
-    if isinstance(given, PairSet):
-        return Pairs(given, {"name": "tidy", "path": IN_MEMORY})
-    return read(given)
+    dataset = of_data.pop("data", None)
+    reading = {key.partition(".")[2]: value for key, value in of_data.items()}
+    return read(given, dataset=dataset, **reading)
+
+
+def without_data(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a call that are not of `data`, which `pairs_from` reads."""
+    return {key: value for key, value in settings.items() if not _is_of_data(key)}
+
+
+def _is_of_data(key: str) -> bool:
+    return key.partition(".")[0] == "data"

@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 
 from cfx.api.fit import Fit
-from cfx.api.pairs import PairsLike, pairs_from
+from cfx.api.pairs import PairsLike, pairs_from, without_data
 from cfx.app.overrides import config_of
 from cfx.core import registry
 from cfx.core.guest import visit
@@ -72,7 +72,8 @@ def simulate(
         at: s after a pair's first frame, from whose measured state the follower is simulated.
         gap: behind a given leader: the first bumper-to-bumper gap, m; None: 2 m and 1.5 s.
         speed: behind a given leader: the follower's first speed, m/s; None: the leader's.
-        settings: of the command line: `**{"model.limits": None}`.
+        settings: of the model, as on the command line: `**{"model.limits": None}`; of reading a
+            file, `**{"data.max_pairs": 20}`.
 
     Returns:
         A row per follower and frame: pair_id, time_s, leader_speed (m/s), position (m), speed
@@ -103,15 +104,22 @@ def simulate(
                 f"the parameters are of model={parameters.model}, not of model={model}; simulate"
                 " that model, or give others"
             )
+        of_model = without_data(settings)
+        for key, value in of_model.items():
+            if not key.startswith("model."):
+                raise ConfigError(
+                    f"{key}={value} does nothing here: a simulation reads the model's settings and"
+                    " those of data alone; leave it out"
+                )
         made = cast(
-            DrivingModel, registry.create("model", config_of({"model": model, **settings}).model)
+            DrivingModel, registry.create("model", config_of({"model": model, **of_model}).model)
         )
         if made.needs_simulator:
             raise ConfigError(
                 f"model={model} has equations in {made.needs_simulator} alone and cannot be"
                 " simulated here; run a job with it"
             )
-        recording = _recording(parameters, pairs, leader, gap, speed)
+        recording = _recording(parameters, pairs, leader, (gap, speed), settings)
         batch = PairBatch.of(recording)
         first = round(at / batch.dt)
         if not 0 <= first < int(batch.lengths.min()) - 1:
@@ -139,10 +147,24 @@ def _recording(
     parameters: Parameters,
     pairs: PairsLike | None,
     leader: pd.DataFrame | pd.Series | None,
-    gap: float | None,
-    speed: float | None,
+    start: tuple[float | None, float | None],
+    settings: Mapping[str, Any],
 ) -> PairSet:
-    """Returns the leaders, and where their followers start."""
+    """Returns the leaders, and where their followers start.
+
+    Args:
+        parameters, pairs, leader: as of `simulate`.
+        start: gap (m) and speed (m/s) of a follower of `leader`.
+        settings: of the call; those of `data` say how a file is read.
+
+    Raises:
+        CfxError: these do not belong together.
+    """
+    gap, speed = start
+    read_from_file = pairs is not None and leader is None
+    for key, value in settings.items():
+        if key not in without_data(settings) and not read_from_file:
+            raise ConfigError(f"{key}={value} does nothing here: no file is read; leave it out")
     if leader is not None:
         if pairs is not None:
             raise ConfigError("give pairs or leader, not both")
@@ -156,7 +178,7 @@ def _recording(
         return parameters.recorded.selected
     if pairs is None:
         raise ConfigError("give recorded pairs, or leader=FRAME with columns time_s and speed")
-    return pairs_from(pairs).selected
+    return pairs_from(pairs, settings).selected
 
 
 def _behind(

@@ -7,19 +7,21 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import TYPE_CHECKING, Any, ClassVar, cast
 
 from cfx.core import registry
+from cfx.errors import ConfigError
 
 if TYPE_CHECKING:
-    import numpy as np
     import pandas as pd
     from numpy.typing import NDArray
     from torch import Tensor
+    from xarray import DataTree
 
     from cfx.calibration.settings import CalibrationSettings
     from cfx.calibration.shards import Solver
     from cfx.data.pairs import PairBatch
+    from cfx.models.base import DrivingModel
 
 
 class DriverPosteriors(ABC):
@@ -30,13 +32,14 @@ class DriverPosteriors(ABC):
     them."""
 
     @abstractmethod
-    def columns(self) -> Mapping[str, NDArray[np.float64]]:
+    def columns(self) -> Mapping[str, NDArray[Any]]:
         """Returns columns for a row per driver of the table `fits`, `(P,)` each.
 
         `median_NAME`, `low_NAME`, `high_NAME`, `contraction_NAME`, `noise_scale`,
         `noise_correlation`, `noise_left`, `effective_samples`, and `pareto_k` (with
-        `expected_coverage`, if a network has learned) or `r_hat` and `divergences`; the table says
-        what they mean.
+        `expected_coverage`, if a network has learned) or `r_hat` and `divergences`; where forecasts
+        were compared with held-out parts, `held` and `held_chance`; where there are several kinds
+        of noise, `noise` and `noise_gain`. The table says what they mean.
         """
 
     @abstractmethod
@@ -46,6 +49,21 @@ class DriverPosteriors(ABC):
         Args:
             ids: of the pairs.
         """
+
+    def inference_data(self, ids: Sequence[str], model: DrivingModel) -> DataTree:
+        """Returns the draws as ArviZ reads them.
+
+        Args:
+            ids: of the pairs.
+            model: whose parameters they are.
+
+        Raises:
+            ConfigError: this posterior has no such form; the base class raises it.
+        """
+        raise ConfigError(
+            f"{type(self).__name__} does not give its draws as ArviZ reads them; take"
+            " calibration.posterior=laplace, nuts, sbi or hierarchical"
+        )
 
     @abstractmethod
     def draw_drivers(self, count: int, seed: int) -> Tensor:

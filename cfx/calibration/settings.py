@@ -37,6 +37,12 @@ OFF = 0.05
 """Distance from `LEVEL` of what a network's intervals hold of simulated drivers' parameters, above
 which it is said."""
 
+UNLIKELY = 0.05
+"""Chance below which a fan that is right holds as little of a held-out part: one driver in 20."""
+
+CORRELATED = 0.3
+"""Correlation that noise may keep from step to step before it is said."""
+
 ENOUGH = 100.0
 """Effective samples below which the ends of a 90 % interval move by a tenth of its width or so from
 one seed to the next (the 5 % point of a normal distribution: standard error 0.21 deviations)."""
@@ -66,6 +72,13 @@ class CalibrationSettings(Settings):
         " simulations; hierarchical: with a prior that all drivers of the"
         " job give; none: the point estimate alone",
     )
+    noise: Literal["chosen", "trajectory", "measurement", "acceleration", "both"] = Field(
+        "chosen",
+        description="where the posterior's noise enters. trajectory: errors of one closed loop last"
+        " for seconds; measurement: they are white; acceleration: drivers do not accelerate as the"
+        " model says, and drive on from where that leads; both: acceleration and measurement, in"
+        " shares that are estimated; chosen: the most evident one, of all drivers together",
+    )
     noise_step_s: float = Field(
         1.0,
         gt=0,
@@ -79,14 +92,53 @@ class CalibrationSettings(Settings):
     @model_validator(mode="after")
     def _noise_belongs_to_a_posterior(self) -> CalibrationSettings:
         if self.posterior == "none":
-            for name in ("noise_step_s", "noise_order"):
+            for name in ("noise", "noise_step_s", "noise_order"):
                 value = getattr(self, name)
                 if value != type(self).model_fields[name].default:
                     raise ValueError(
                         f"calibration.{name}={value}: there is no posterior, so it does nothing;"
                         " leave it out, or set calibration.posterior=laplace"
                     )
+        if self.noise == "measurement" and self.noise_order != 1:
+            raise ValueError(
+                f"calibration.noise_order={self.noise_order}: calibration.noise=measurement is"
+                " white, so it does nothing; leave it out, or set calibration.noise=trajectory"
+            )
         return self
+
+
+def are_contradicted(rows: pd.DataFrame) -> pd.Series:
+    """Returns whose held-out part the posterior's forecasts hold less of than chance allows.
+
+    Args:
+        rows: of the table `fits`. Where nothing was held out, nobody's.
+    """
+    if "held_chance" not in rows:
+        return rows["noise_scale"] < 0  # nobody's
+    return rows["held_chance"] < UNLIKELY
+
+
+def doubts(rows: pd.DataFrame) -> pd.Series:
+    """Returns why each driver's interval is not to be taken at its word; "" where nothing is known.
+
+    Args:
+        rows: of the table `fits`, with a posterior's columns.
+    """
+    # A wrong setting is answered before pandas is there.
+    import pandas as pd
+
+    reasons = pd.DataFrame(
+        {
+            "samples do not settle": ~are_reliable(rows),
+            "forecasts miss the held-out part": are_contradicted(rows),
+            "noise stays correlated": rows["noise_left"].abs() > CORRELATED,
+        },
+        rows.index,
+    )
+    found = []
+    for _, holds in reasons.iterrows():
+        found.append("; ".join(holds.index[holds.to_numpy(bool)]))
+    return pd.Series(found, rows.index, name="doubt", dtype=str)
 
 
 def are_reliable(rows: pd.DataFrame) -> pd.Series:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import pandas as pd
@@ -16,6 +16,7 @@ from rich.text import Text
 
 from cfx.calibration.identifiability import flat_for
 from cfx.calibration.settings import (
+    CORRELATED,
     DIVERGENT,
     ENOUGH,
     INTERVAL_LEVEL,
@@ -23,6 +24,8 @@ from cfx.calibration.settings import (
     MIN_NARROWING,
     MIXED,
     OFF,
+    UNLIKELY,
+    are_contradicted,
     are_reliable,
 )
 from cfx.core.parameters import Parameter
@@ -254,8 +257,24 @@ class Slices(ResultTable):
     )
 
 
-_CORRELATED = 0.3
-"""Correlation that noise may keep before the job says so."""
+_NOISE = {
+    "trajectory": "errors of a whole trajectory, which last for seconds",
+    "measurement": "white errors of the measurement",
+    "acceleration": "the driver's acceleration, which differs from the model's",
+    "both": "the driver's acceleration and errors of the measurement",
+}
+
+
+def noise_evidence(tables: Mapping[str, pd.DataFrame]) -> dict[str, float]:
+    """Returns the log evidence of each kind of noise, of all pairs together.
+
+    Args:
+        tables: of a job; without `noise` there is none.
+    """
+    if "noise" not in tables:
+        return {}
+    totals = tables["noise"].groupby("noise")["log_evidence"].sum()
+    return {str(kind): float(total) for kind, total in totals.items()}
 
 
 @dataclass(frozen=True)
@@ -265,10 +284,13 @@ class KnownParameters:
     Attributes:
         rows: the posterior's columns, a row per pair.
         parameters: those that were calibrated.
+        evidence: log evidence of each kind of noise that was tried, of all pairs together; empty
+            where the posterior knows one alone.
     """
 
     rows: pd.DataFrame
     parameters: tuple[Parameter, ...]
+    evidence: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def of(cls, evaluation: Evaluation) -> KnownParameters | None:
@@ -277,7 +299,8 @@ class KnownParameters:
         if fits is None or "noise_scale" not in fits:
             return None
         tuned = tuple(one for one in evaluation.parameters if f"median_{one.name}" in fits)
-        return cls(fits[fits["method"] == "driver_specific"], tuned)
+        evidence = noise_evidence(evaluation.tables)
+        return cls(fits[fits["method"] == "driver_specific"], tuned, evidence)
 
     @property
     def reliable(self) -> pd.Series:
@@ -291,9 +314,9 @@ class KnownParameters:
     def metrics(self) -> dict[str, float]:
         """Returns what MLflow keeps too.
 
-        `posterior/determined/NAME` and `posterior/reliable` are shares of pairs,
-        `posterior/noise_left`, `posterior/effective_samples` and `posterior/expected_coverage`
-        (`sbi`) medians.
+        `posterior/determined/NAME`, `posterior/reliable` and `posterior/contradicted` are shares of
+        pairs, `posterior/held` is the mean over pairs, `posterior/noise_left`,
+        `posterior/effective_samples` and `posterior/expected_coverage` (`sbi`) are medians.
         """
         found = {}
         for one in self.parameters:
@@ -302,7 +325,15 @@ class KnownParameters:
         for name in ("noise_left", "effective_samples", "expected_coverage"):
             if name in self.rows:
                 found[f"posterior/{name}"] = float(self.rows[name].median())
+        if self.checked:
+            found["posterior/held"] = float(self.rows["held"].mean())
+            found["posterior/contradicted"] = float(are_contradicted(self.rows).mean())
         return found
+
+    @property
+    def checked(self) -> bool:
+        """Whether forecasts were compared with held-out parts."""
+        return "held" in self.rows and bool(self.rows["held"].notna().any())
 
     def printed(self) -> list[RenderableType]:
         """Returns the table of parameters, then what is not determined, then a warning if due."""
@@ -334,14 +365,48 @@ class KnownParameters:
                 f" (intervals less than {MIN_NARROWING:.0%} narrower than the prior's;"
                 " contraction_NAME in fits.parquet)."
             )
+        sentences += self._noise()
         left = float(self.rows["noise_left"].median())
-        if abs(left) > _CORRELATED:
+        if abs(left) > CORRELATED:
             sentences.append(
                 f"What the noise's model leaves is still correlated ({left:.2f} from step to step):"
                 " intervals may be too narrow; try calibration.noise_order=2 or longer steps"
                 " (calibration.noise_step_s)."
             )
         return [table, *map(Text, sentences)]
+
+    def _noise(self) -> list[str]:
+        """Returns where noise enters, and whether forecasts with it hold what happened."""
+        sentences = []
+        if "noise" in self.rows:
+            name = str(self.rows["noise"].iloc[0])
+            said = f"Noise: {_NOISE[name]} (calibration.noise={name})"
+            others = {kind: value for kind, value in self.evidence.items() if kind != name}
+            if others:
+                second = max(others, key=others.__getitem__)
+                ahead = self.evidence[name] - others[second]
+                said += f", the most evident kind; {second} comes next, {ahead:.0f} nats behind"
+            sentences.append(f"{said}.")
+        pairs = len(self.rows)
+        if "held" in self.rows and not self.checked:
+            sentences.append(
+                "Nothing was held out (split=1), so that nothing checks these intervals."
+            )
+        if self.checked:
+            missed = int(are_contradicted(self.rows).sum())
+            said = (
+                f"Forecasts from these posteriors hold {self.rows['held'].mean():.0%} of the"
+                f" held-out parts ({INTERVAL_LEVEL:.0%} would be right)"
+            )
+            allowed = UNLIKELY * pairs + 2.0 * math.sqrt(UNLIKELY * (1.0 - UNLIKELY) * pairs)
+            if missed > allowed:
+                said += (
+                    f"; of {missed} of {pairs} pairs less than chance allows (held_chance below"
+                    f" {UNLIKELY:g} in fits.parquet): doubt the intervals, the model or its noise"
+                    " is not theirs"
+                )
+            sentences.append(f"{said}.")
+        return sentences
 
     def _doubts(self) -> list[str]:
         """Returns which pairs' intervals are not to be relied on, and which are rough."""
@@ -415,9 +480,31 @@ class Fits(ResultTable):
             "by which share the interval is narrower than a priori; below 0.3 the recording does"
             " not determine the parameter",
         ),
+        Column("noise", "", "where noise enters (`calibration.noise`)", "text", required=False),
+        Column(
+            "noise_gain",
+            "1",
+            "the driver's own share of it: 0, predicted in one closed loop, to 1, from each"
+            " measured state to the next",
+            required=False,
+        ),
         Column("noise_scale", "m/s or m", "what each step of the noise adds", required=False),
         Column("noise_correlation", "1", "of the noise, one step later", required=False),
         Column("noise_left", "1", "the same of what its model leaves; 0: all", required=False),
+        Column("held", "1", "share of the held-out steps that the 90 % fan holds", required=False),
+        Column(
+            "held_chance",
+            "1",
+            "how likely a fan that is right holds as little; below 0.05 the interval is in doubt",
+            required=False,
+        ),
+        Column(
+            "doubt",
+            "",
+            "why the interval is not to be taken at its word; empty where nothing is known",
+            "text",
+            required=False,
+        ),
         Column("effective_samples", "1", "effective sample size of the intervals", required=False),
         Column(
             "pareto_k", "1", "above 0.7 these intervals are not to be relied on", required=False

@@ -73,7 +73,12 @@ class Stepper(ABC):
         return False
 
     def accumulate(
-        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, every: int | None = None
+        self,
+        segments: Segments,
+        p: Mapping[str, Tensor],
+        terms: Terms,
+        every: int | None = None,
+        gain: Tensor | None = None,
     ) -> tuple[Tensor, ...] | None:
         """Simulates segments and sums up what their frames add, without keeping trajectories.
 
@@ -82,6 +87,10 @@ class Stepper(ABC):
             p: one tensor per parameter, `()` or broadcasting to `(P, q)`.
             terms: what a frame adds to each sum.
             every: the terms of each so many-th frame, instead of sums.
+            gain: by which share g of the way position and speed move to the measured ones after
+                each of these frames in the end, `(P, q)`: g + (1 - g) / (t + 1) after the t-th, as
+                the state at the start was measured once. Terms are of what is predicted from there.
+                None: not at all.
 
         Returns:
             Each sum over the frames that count, `(P, q)`, or each term of frames `every`,

@@ -157,7 +157,12 @@ class MemoryStepper(Stepper):
         return kernel.exists(self.model, self.dt, p, terms)
 
     def accumulate(
-        self, segments: Segments, p: Mapping[str, Tensor], terms: Terms, every: int | None = None
+        self,
+        segments: Segments,
+        p: Mapping[str, Tensor],
+        terms: Terms,
+        every: int | None = None,
+        gain: Tensor | None = None,
     ) -> tuple[Tensor, ...] | None:
         candidates = 1
         for value in p.values():
@@ -165,7 +170,7 @@ class MemoryStepper(Stepper):
         steps = segments.counted.numel() * candidates
         if segments.speed.device.type != "cpu" or not self._pays(steps, _WORTH_A_KERNEL):
             return None
-        return kernel.accumulate(self.model, self.dt, segments, p, terms, every)
+        return kernel.accumulate(self.model, self.dt, segments, p, terms, every, gain)
 
     def _compiles(self, steps: int, speed: Tensor) -> bool:
         return self._pays(steps * speed.numel(), _WORTH_COMPILING) and can_compile(speed.device)

@@ -114,6 +114,75 @@ def test_a_posterior_is_that_of_the_command_and_gives_new_drivers(
     assert list(drive["pair_id"].unique()) == list(new.index)
 
 
+@needs("cfx-posteriors")
+def test_intervals_come_with_their_doubt_and_draws_as_arviz_reads_them(pairs: cfx.Pairs) -> None:
+    fit = cfx.calibrate(pairs, "krauss", posterior="laplace", **RANDOM)
+    assert "calibration.posterior=laplace" in fit.command
+    rows = fit.intervals
+    assert (rows["noise"] == rows["noise"].iloc[0]).all()
+    assert rows["held"].between(0.0, 1.0).all()
+    in_doubt = (rows["pareto_k"] > 0.7) | (rows["held_chance"] < 0.05)
+    in_doubt |= rows["noise_left"].abs() > 0.3
+    assert ((rows["doubt"] != "") == in_doubt).all()
+    tree = fit.inference_data()
+    assert dict(tree["posterior"].sizes) == {"chain": 1, "draw": 200, "pair": len(pairs)}
+    for pair_id in rows.index:
+        drawn = fit.draws.loc[pair_id, "t_r"].to_numpy()
+        its = tree["posterior"]["t_r"].sel(chain=0, pair=pair_id).to_numpy()
+        np.testing.assert_allclose(its, drawn)
+    assert {"prior", "diagnostics"} <= set(tree.children)
+    with pytest.raises(ConfigError, match=r"give posterior=\.\.\. or calibration\.posterior"):
+        cfx.calibrate(pairs, posterior="laplace", **{"calibration.posterior": "nuts"})
+
+
+def test_settings_of_data_choose_what_is_read_or_are_refused(
+    pairs: cfx.Pairs, tmp_path: Path
+) -> None:
+    path = tmp_path / "pairs.parquet"
+    pairs.save(path)
+    fewer = {"data.max_pairs": 1, "data.min_duration": 0}
+    assert len(cfx.calibrate(path, "krauss", **RANDOM, **fewer).parameters) == 1
+    assert len(cfx.config(path, **fewer).pairs or ()) == 1
+    driven = cfx.simulate("krauss", None, path, **fewer)["pair_id"]
+    assert (driven == driven.iloc[0]).all()
+    calls = (
+        lambda: cfx.calibrate(pairs, "krauss", **fewer),
+        lambda: cfx.config(pairs, **fewer),
+        lambda: cfx.train(pairs, "krauss", **fewer),
+        lambda: cfx.evaluate("cfx://i80-idm", pairs, **fewer),
+        lambda: cfx.forecast("cfx://i80-idm", pairs, at=1.0, **fewer),
+        lambda: cfx.simulate("krauss", None, pairs, **fewer),
+    )
+    for call in calls:
+        with pytest.raises(ConfigError, match=r"data\.max_pairs=1: these pairs have been read"):
+            call()
+    with pytest.raises(ConfigError, match=r"data\.max_pairs=1 does nothing here"):
+        cfx.simulate("krauss", None, leader=LEADER, **fewer)
+
+
+@pytest.mark.parametrize("setting", ["tracking.enabled", "cache.folder", "output.url", "demo"])
+def test_settings_that_do_nothing_in_python_are_refused(pairs: cfx.Pairs, setting: str) -> None:
+    given = {setting: "x"}
+    calls = (
+        lambda: cfx.calibrate(pairs, "krauss", **given),
+        lambda: cfx.train(pairs, "krauss", **given),
+        lambda: cfx.evaluate("cfx://i80-idm", pairs, **given),
+        lambda: cfx.forecast("cfx://i80-idm", pairs, at=1.0, **given),
+        lambda: cfx.simulate("krauss", None, pairs, **given),
+    )
+    for call in calls:
+        with pytest.raises(ConfigError, match=rf"{setting}=x does nothing here: .*; leave it out"):
+            call()
+
+
+@pytest.mark.parametrize("setting", ["policy", "learner.epochs", "protocol.folds"])
+def test_settings_of_training_are_refused_where_parameters_are_calibrated(
+    pairs: cfx.Pairs, setting: str
+) -> None:
+    with pytest.raises(ConfigError, match=f"{setting}=3 does nothing here"):
+        cfx.calibrate(pairs, "krauss", **{setting: 3})
+
+
 def test_without_a_posterior_there_are_no_intervals(fit: cfx.Fit) -> None:
     with pytest.raises(ConfigError, match=r"there is no posterior; say cfx\.calibrate"):
         _ = fit.intervals

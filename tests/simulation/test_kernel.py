@@ -21,6 +21,7 @@ from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import literal
 from cfx.simulation.kernel.run import KernelKey, accumulate
 from cfx.simulation.rollout import MemoryStepper
+from cfx.simulation.step import advance_vehicle
 from cfx.simulation.trajectory import ComponentKey, Segments, Start, Terms
 
 DT = 0.1
@@ -496,3 +497,35 @@ def test_operations_with_options_have_a_kernel_with_the_losses_of_pytorch(
     expected = simulated(MemoryStepper(model, DT, compile="never"), objective, segments, p)
     assert losses is not None
     torch.testing.assert_close(losses, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_states_that_are_corrected_are_those_of_steps_one_by_one() -> None:
+    model, segments, every = W99(), made_up_segments(), 5
+    p, terms = candidates_of(model), terms_of(SpeedRmse())
+    gain = torch.linspace(0.0, 1.0, CANDIDATES, dtype=torch.float64).expand(PROBLEMS, -1)
+    stepper = MemoryStepper(model, DT, compile="always")
+    found = stepper.accumulate(segments, p, terms, every, gain)
+    assert found is not None
+    shape = (PROBLEMS, CANDIDATES)
+    begin = (segments.position, segments.speed, segments.acceleration)
+    follower = stepper.begin(Start(*(value[:, None].expand(shape) for value in begin)))
+    for step in range(STEPS):
+        leader = Leader(
+            segments.leader_position[step, :, None],
+            segments.leader_speed[step, :, None],
+            segments.leader_acceleration[step, :, None],
+            segments.leader_length[:, None],
+        )
+        follower = advance_vehicle(model, follower, leader, p, DT)
+        if (step + 1) % every:
+            continue
+        number = (step + 1) // every
+        error = follower.speed - segments.measured_speed[step, :, None]
+        expected = error.square() * segments.counted[step, :, None]
+        torch.testing.assert_close(found[0][number - 1], expected, rtol=1e-9, atol=1e-12)
+        share = gain + (1.0 - gain) / (number + 1)
+        measured = (segments.leader_rear - segments.measured_gap)[step, :, None]
+        follower = follower._replace(
+            position=follower.position + share * (measured - follower.position),
+            speed=follower.speed - share * error,
+        )

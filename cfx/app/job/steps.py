@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from cfx.calibration.losses import prior_weight
 from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import Optimizer
 from cfx.calibration.posterior import posterior_method
-from cfx.calibration.settings import CalibrationSettings
+from cfx.calibration.settings import CalibrationSettings, doubts
 from cfx.calibration.shards import Solver
 from cfx.core import registry
 from cfx.core.distributions import OWN
@@ -49,6 +50,7 @@ from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
 from cfx.results.provenance import commit, distributions, version
 from cfx.results.result import Result
+from cfx.results.tables import noise_evidence
 from cfx.results.tracker import folder_of, is_run_id
 from cfx.simulation.base import Simulator
 from cfx.simulation.rollout import MemorySimulator, MemoryStepper
@@ -111,7 +113,9 @@ def calibration_tables(
                 solver = context.calibrator.solver
                 method_of = posterior_method(settings.posterior)
                 known = method_of.find(solver, batch, last, parameters, settings)
-                rows = rows.join(pd.DataFrame(known.columns(), index=ids), on="pair_id")
+                intervals = pd.DataFrame(known.columns(), index=ids)
+                intervals["doubt"] = doubts(intervals)
+                rows = rows.join(intervals, on="pair_id")
                 tables = known.tables(ids)
             fits.append(rows)
     if not elsewhere:
@@ -260,6 +264,14 @@ def prepare(config: JobConfig) -> tuple[JobConfig, JobComponents]:
                 " too often for any simulator but simulator=memory alone; take"
                 " calibration.posterior=laplace or sbi, or leave one of them out"
             )
+        noise = config.calibration.noise
+        starts_again = noise not in {"chosen", "trajectory"}
+        if starts_again and not isinstance(components.simulator, MemorySimulator):
+            raise ConfigError(
+                f"calibration.noise={noise} corrects states while it simulates, which"
+                " simulator=memory alone can; set calibration.noise=trajectory, or leave one of"
+                " them out"
+            )
     return config, components
 
 
@@ -392,7 +404,7 @@ def find(context: ProtocolContext, components: JobComponents, config: JobConfig)
     return Result.of(
         evaluation,
         config=config.model_dump(mode="json"),
-        data=description(context, delivered, config, components),
+        data={**description(context, delivered, config, components), **noise_of(tables)},
         metrics=metrics,
         trained=delivered.policy,
     )
@@ -409,6 +421,14 @@ def job_tables(
     if sites is not None:
         tables["sites"] = sites
     return tables
+
+
+def noise_of(tables: Mapping[str, pd.DataFrame]) -> dict[str, Any]:
+    """Returns what `data.json` says of a posterior's noise: its kind, and the evidence of each."""
+    if "noise" not in tables:
+        return {}
+    chosen = tables["noise"].query("chosen")["noise"].iloc[0]
+    return {"noise": {"kind": chosen, "log_evidence": noise_evidence(tables)}}
 
 
 def description(

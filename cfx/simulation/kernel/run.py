@@ -49,6 +49,7 @@ class KernelKey(NamedTuple):
         parameters: names of the model's parameters, and whether candidates differ in each.
         dtype: of all values.
         summed: whether terms are summed up over frames.
+        corrected: whether states are corrected by measured ones.
     """
 
     model: ComponentKey
@@ -58,6 +59,7 @@ class KernelKey(NamedTuple):
     parameters: tuple[tuple[str, bool], ...]
     dtype: torch.dtype
     summed: bool = True
+    corrected: bool = False
 
     def lasting(self) -> str | None:
         """Returns a key that other processes agree on; None if there is none.
@@ -74,6 +76,7 @@ class KernelKey(NamedTuple):
                 return None
             described.append([code, key.settings])
         described += [self.temperature, self.dt, self.parameters, self.dtype, self.summed]
+        described.append(self.corrected)
         described.append(torch.__version__)
         return content_key(described)
 
@@ -115,6 +118,7 @@ def accumulate(
     p: Mapping[str, Tensor],
     terms: Terms,
     every: int | None = None,
+    gain: Tensor | None = None,
 ) -> tuple[Tensor, ...] | None:
     """Simulates segments in closed loop and computes the terms of their frames that count.
 
@@ -127,12 +131,15 @@ def accumulate(
         p: one tensor per parameter, `()`, or broadcasting to `(P, q)`.
         terms: what a frame adds to each sum.
         every: the terms of each so many-th frame, instead of sums.
+        gain: by which share g of the way position and speed move to the measured ones after each of
+            these frames in the end, `(P, q)`, in the dtype of the segments: g + (1 - g) / (t + 1)
+            after the t-th, as the state at the start was measured once. None: not at all.
 
     Returns:
         Each sum, `(P, q)`, or each term of frames `every`, `2 every` and so on, `(K // every, P,
         q)`, 0 where a frame does not count; None where no kernel can be made of this model.
     """
-    kernel = _kernel(model, dt, p, terms, summed=every is None)
+    kernel = _kernel(model, dt, p, terms, summed=every is None, corrected=gain is not None)
     if kernel is None:
         return None
     keep_freed_memory()
@@ -149,7 +156,8 @@ def accumulate(
         count = len(segments.counted) // every
         sums = segments.speed.new_zeros((kernel.terms, count, *shape))
         rows = ctypes.c_long(count), ctypes.c_long(every)
-    _run(kernel, segments, list(p.values()), memory, sums, rows)
+    corrections = gain if gain is None else _parameter(gain, *shape)
+    _run(kernel, segments, list(p.values()), memory, sums, (*rows, corrections))
     return tuple(sums)
 
 
@@ -170,6 +178,7 @@ def _kernel(
     terms: Terms,
     *,
     summed: bool = True,
+    corrected: bool = False,
 ) -> _Kernel | None:
     """Returns the kernel for a model and an objective, made at the first call."""
     varied = []
@@ -183,6 +192,7 @@ def _kernel(
         parameters=tuple(varied),
         dtype=next(iter(p.values())).dtype,
         summed=summed,
+        corrected=corrected,
     )
     with _MAKING:
         if key not in _KERNELS:
@@ -218,7 +228,7 @@ def _source(model: DrivingModel, terms: Terms, key: KernelKey) -> str:
         name = _without_kernel(model, terms, key.dtype)
         log.info("%s has no compiled kernel (%s); PyTorch simulates it", name, reason)
         return ""
-    return write(program, varied, key.dtype, summed=key.summed)
+    return write(program, varied, key.dtype, summed=key.summed, corrected=key.corrected)
 
 
 def _without_kernel(model: DrivingModel, terms: Terms, dtype: torch.dtype) -> str:
@@ -237,8 +247,16 @@ def _run(
     parameters: Sequence[Tensor],
     memory: Tensor,
     sums: Tensor,
-    rows: tuple[ctypes.c_long, ctypes.c_long],
+    frames: tuple[ctypes.c_long, ctypes.c_long, _TensorView | None],
 ) -> None:
+    """Runs a kernel on all shards.
+
+    Args:
+        kernel: what is run.
+        segments, parameters, memory: what it reads.
+        sums: what it writes.
+        frames: how many frames are written, how many steps apart they are, and the gain.
+    """
     problems, candidates = sums.shape[-2:]
     ends = _ends(segments.counted)
     signals = []
@@ -250,6 +268,8 @@ def _run(
     counted = _signal(segments.counted)
     remembered = _TensorView(memory.data_ptr(), memory.stride(0), memory.stride(1))
     shards = problems * -(-candidates // BLOCK)
+    rows, every, gain = frames
+    corrections = None if gain is None else ctypes.byref(gain)
 
     def take(first: int) -> None:
         kernel.function(
@@ -261,7 +281,9 @@ def _run(
             ctypes.c_void_p(sums.data_ptr()),
             ctypes.c_long(problems),
             ctypes.c_long(candidates),
-            *rows,
+            rows,
+            every,
+            corrections,
             ctypes.c_long(first),
             ctypes.c_long(min(first + _SHARDS_AT_ONCE, shards)),
         )

@@ -73,7 +73,7 @@ struct View { const real* data; long problem; long other; };
 extern "C" void accumulate(
     const View* signals, const View* parameters, const View* counted, const long* ends,
     const View* memory, real* sums, long problems, long candidates, long rows, long every,
-    long first, long last) {
+    const View* gain, long first, long last) {
   const long blocks = (candidates + BLOCK - 1) / BLOCK;
   for (long shard = first; shard < last; ++shard) {
     const long i = shard / blocks, begin = (shard % blocks) * BLOCK;
@@ -103,7 +103,12 @@ SIGNALS = (*_SIGNALS, *_CONSTANT_SIGNALS)
 
 
 def write(
-    program: StepProgram, varied: Sequence[bool], dtype: torch.dtype, *, summed: bool = True
+    program: StepProgram,
+    varied: Sequence[bool],
+    dtype: torch.dtype,
+    *,
+    summed: bool = True,
+    corrected: bool = False,
 ) -> str:
     """Returns the C++ source of a kernel.
 
@@ -112,13 +117,14 @@ def write(
         varied: for each parameter, whether candidates differ in it; the others are numbers.
         dtype: float64 or float32.
         summed: whether terms are summed up over frames; else those of single frames are written.
+        corrected: whether states move towards the measured ones after each frame that is written.
     """
     lines = [head(dtype, BLOCK) + _ACCUMULATE]
     shift = _shift(program.memory)
     lines += _begin(varied, len(program.terms), len(program.memory), shift)
     constant = _constant_in_time(program, varied)
     lines += _before(constant, varied)
-    lines += _loop(program, varied, shift, constant, summed=summed)
+    lines += _loop(program, varied, shift, constant, summed=summed, corrected=corrected)
     if summed:
         for k in range(len(program.terms)):
             target = f"sums[({k} * problems + i) * candidates + begin + j]"
@@ -219,6 +225,7 @@ def _loop(
     constant: Sequence[Assignment],
     *,
     summed: bool,
+    corrected: bool,
 ) -> list[str]:
     """Returns the loop over time, with the loop over candidates inside."""
     lines = ["    for (long t = 0; t < ends[i]; ++t) {"]
@@ -253,7 +260,7 @@ def _loop(
             lines.append(f"        N[{k}][j] = {value};")
     lines.append("      }")
     if not summed:
-        lines += _written(len(program.terms))
+        lines += _written(len(program.terms), corrected=corrected)
     if program.memory:
         lines.append("      M = N;")
     lines.append("    }")
@@ -268,13 +275,23 @@ def _added(terms: int, *, summed: bool) -> list[str]:
     return [f"        S{k}[j] {sign} added{k} * weight;" for k in range(terms)]
 
 
-def _written(terms: int) -> list[str]:
-    """Returns what writes the terms of single frames."""
+def _written(terms: int, *, corrected: bool) -> list[str]:
+    """Returns what writes the terms of single frames, and corrects the states after them."""
     lines = ["      if ((t + 1) % every == 0) {"]
     for k in range(terms):
         row = f"{k} * rows + (t + 1) / every - 1"
         target = f"sums + (({row}) * problems + i) * candidates + begin"
         lines.append(f"        std::memcpy({target}, S{k}, sizeof(real) * width);")
+    if corrected:
+        gain = "gain->data[i * gain->problem + (begin + j) * gain->other]"
+        lines.append("        for (long j = 0; j < width; ++j) {")
+        lines.append(f"          const real steady = {gain};")
+        lines.append(
+            "          const real g = steady + (real(1) - steady) / real((t + 1) / every + 1);"
+        )
+        lines.append("          X[j] += g * (leader_rear - measured_gap - X[j]);")
+        lines.append("          V[j] += g * (measured_speed - V[j]);")
+        lines.append("        }")
     lines.append("      }")
     return lines
 

@@ -1,7 +1,14 @@
 """Fans of trajectories: what a driver's posterior says of what they did, and did afterwards.
 
-On the part that was calibrated on a fan is of simulated trajectories alone. After it the noise goes
-on from its last error: the fan is a forecast, and should hold what happened as often as it says.
+On the part that was calibrated on a fan is of predictions without noise: one closed loop, or from
+step to step, as the kind of noise has it. After it each draw drives on without what was measured,
+and its noise goes on from the last error and enters where it enters: the fan is a forecast.
+
+Whether forecasts hold what happened as often as they say is the check of a posterior (posterior
+predictive check on a part that was held out; A. Gelman, X.-L. Meng and H. Stern 1996, *Posterior
+predictive assessment of model fitness via realized discrepancies*, Statistica Sinica 6). Errors
+last, so that a fan that is right may miss most of one driver's part: what is missed is compared
+with what the fan misses of its own paths.
 
 Shapes: P drivers, q draws, d coordinates, K steps of the noise.
 """
@@ -16,12 +23,13 @@ import pandas as pd
 import torch
 from torch import Tensor
 
+from cfx.plugin import threads
 from cfx_posteriors import noise
 from cfx_posteriors.density import Posterior
 
 
 class Fan(NamedTuple):
-    """Quantiles of a signal of P drivers.
+    """Paths of a signal of P drivers, and their quantiles.
 
     Attributes:
         signal: `speed` (m/s) or `gap` (m).
@@ -30,6 +38,7 @@ class Fan(NamedTuple):
         calibrated: which of them were calibrated on, bool `(P, K)`.
         measured: `(P, K)`.
         quantiles: low, median and high, `(P, K, 3)`.
+        paths: as measured, noise included, `(P, K, q)`.
     """
 
     signal: str
@@ -38,6 +47,35 @@ class Fan(NamedTuple):
     calibrated: Tensor
     measured: Tensor
     quantiles: Tensor
+    paths: Tensor
+
+    def check(self, seed: int) -> dict[str, Tensor]:
+        """Returns how much of the held-out parts is within the fan, and by what chance.
+
+        Args:
+            seed: of ties, which are broken at random.
+
+        Returns:
+            `held`, the share of each driver's held-out steps that the fan holds, and `held_chance`,
+            how likely it is for the fan's own paths to be held as little, `(P,)` each. NaN where no
+            part was held out.
+        """
+        after = self.counted & ~self.calibrated
+        count = after.sum(1)
+        low, _, high = self.quantiles.unbind(-1)
+
+        def within(paths: Tensor) -> Tensor:
+            is_in = (paths >= low[..., None]) & (paths <= high[..., None])
+            return (is_in & after[..., None]).sum(1) / count[:, None]
+
+        held = within(self.measured[..., None])[:, 0]
+        own = within(self.paths)
+        as_little = (own < held[:, None]).double().mean(1)
+        the_same = (own == held[:, None]).double().mean(1)
+        generator = torch.Generator().manual_seed(seed)
+        part = torch.rand(len(held), generator=generator, dtype=torch.float64)
+        chance = torch.where(count > 0, as_little + part * the_same, torch.nan)
+        return {"held": held, "held_chance": chance}
 
     def table(self, ids: Sequence[str]) -> pd.DataFrame:
         """Returns the table `fan`, a row for each pair and recorded step.
@@ -78,33 +116,47 @@ def fan_of(
     calibrated = count * stride <= frame[:, None]
     size = max(1, memory // (4 * draws.shape[1] * whole.bytes_per_candidate))
     parts = []
-    for drivers in torch.split(torch.arange(len(draws)), size):
-        away = _away(whole.take(drivers), calibrated[drivers], draws[drivers], seed)
-        parts.append(measured[drivers][..., None] + away.quantile(shares, dim=2).movedim(0, 2))
+    with threads.one_thread():  # a path is many small steps
+        for drivers in torch.split(torch.arange(len(draws)), size):
+            parts.append(_paths(whole.take(drivers), calibrated[drivers], draws[drivers], seed))
+    paths = torch.cat(parts)
     return Fan(
         whole.signal,
         count * stride * whole.segments.stepper.dt,
         whole.counted[..., 0].T > 0,
         calibrated,
         measured,
-        torch.cat(parts),
+        paths.quantile(shares, dim=2).movedim(0, 2),
+        paths,
     )
 
 
-def _away(part: Posterior, calibrated: Tensor, draws: Tensor, seed: int) -> Tensor:
-    """Returns how far paths are from what was measured, `(P, K, q)`."""
-    n = len(part.space)
-    errors = part.errors(draws[..., :n]).transpose(0, 1)
-    coefficients, scale = noise.coefficients(draws[..., n:-1]), draws[..., -1].exp()
+def _paths(part: Posterior, calibrated: Tensor, draws: Tensor, seed: int) -> Tensor:
+    """Returns paths of the signal, `(P, K, q)`.
+
+    Args:
+        part: of P drivers, whole recordings.
+        calibrated: the steps that were calibrated on, bool `(P, K)`.
+        draws: `(P, q, d)`.
+        seed: of the noise. All drivers have the same random numbers: none depends on who is worked
+            on beside them.
+    """
+    own = draws[..., part.simulated :]
+    coefficients, scale = noise.coefficients(own[..., :-1]), own[..., -1].exp()
     generator = torch.Generator().manual_seed(seed)
-    gone_on = errors.clone()
-    for step in range(errors.shape[1]):
-        # All drivers have the same random numbers: none depends on who is worked on beside them.
+    predictor = part.predictor(draws)
+    errors: list[Tensor] = []
+    paths = []
+    for step in range(calibrated.shape[1]):
+        predicted, measured = predictor.advance()
         drawn = torch.randn(scale.shape[1], generator=generator, dtype=torch.float64)
         expected = scale * drawn
-        for back in range(min(step, coefficients.shape[-1])):
-            expected = expected + coefficients[..., back] * gone_on[:, step - 1 - back]
+        for back in range(min(step, part.order)):
+            expected = expected + coefficients[..., back] * errors[step - 1 - back]
         known = calibrated[:, step, None]
-        gone_on[:, step] = torch.where(known, errors[:, step], expected)
-    # Errors are simulated minus measured: what is measured is simulated minus noise.
-    return torch.where(calibrated[..., None], errors, errors - gone_on)
+        error = torch.where(known, predicted - measured, expected)
+        predictor.correct(error, known)
+        errors.append(error)
+        # Errors are predicted minus measured: what is measured is predicted minus noise.
+        paths.append(torch.where(known, predicted, predicted - error))
+    return torch.stack(paths, dim=1)

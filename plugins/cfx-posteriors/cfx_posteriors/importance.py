@@ -245,9 +245,9 @@ def _finished(
 
 def _first(posterior: Posterior, normal: Normal) -> Components:
     """Returns Laplace's approximation, and the same with each parameter as wide as a priori."""
-    n = len(posterior.space)
+    n = posterior.simulated
     deviation = torch.diagonal(normal.covariance, dim1=1, dim2=2).sqrt()
-    prior = torch.linalg.inv(posterior.prior.precision).diagonal().sqrt()
+    prior = posterior.prior_deviation()
     wider = torch.full_like(deviation, _WIDER)
     wider[:, :n] = (prior / deviation[:, :n]).clamp(min=1.0)
     factor = torch.linalg.cholesky(normal.covariance)

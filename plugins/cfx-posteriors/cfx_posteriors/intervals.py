@@ -8,7 +8,8 @@ from __future__ import annotations
 import importlib.util
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -16,27 +17,34 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from cfx.errors import NotInstalledError
+from cfx.errors import ConfigError, NotInstalledError
 from cfx.plugin import (
     INTERVAL_LEVEL,
     CalibrationSettings,
     DriverPosteriors,
+    DrivingModel,
+    MemoryStepper,
     PairBatch,
     ParameterSpace,
     PosteriorMethod,
     SegmentLosses,
     Segments,
     Solver,
+    Stepper,
     distributions,
     squashed,
+    threads,
 )
 from cfx_posteriors.density import ParameterPrior, Posterior
 from cfx_posteriors.fan import Fan, fan_of
 from cfx_posteriors.importance import DRAWS, Sampled, sample
-from cfx_posteriors.laplace import Normal, laplace, likely_starts
+from cfx_posteriors.laplace import Normal, laplace, likely_starts, log_evidence
+from cfx_posteriors.noise import NOISE_KINDS, noise_kind
 from cfx_posteriors.population import Population, fit_population
 
 if TYPE_CHECKING:
+    from xarray import DataTree
+
     from cfx_posteriors.neural import Learned
     from cfx_posteriors.nuts import Chains
 
@@ -49,7 +57,13 @@ _WORK = 10**8
 """Vehicle steps that belong together: enough for a compiled kernel."""
 
 
-_OF_DRIVERS = ("noise_scale", "noise_correlation", "noise_left", "effective_samples")
+_OF_DRIVERS = (
+    "noise_scale",
+    "noise_correlation",
+    "noise_gain",
+    "noise_left",
+    "effective_samples",
+)
 
 
 @dataclass(frozen=True)
@@ -63,12 +77,15 @@ class ParameterIntervals(DriverPosteriors):
             logits: 0 where a recording says nothing, 1 where it leaves no doubt.
         noise_scale: `(P,)`, what each step of the noise adds, as the signal: m/s or m.
         noise_correlation: `(P,)`, of the noise with itself one step later.
+        noise_gain: `(P,)`, by which share the noise is the driver's: 0, one closed loop, to 1, from
+            measured state to measured state.
         noise_left: `(P,)`, the same correlation of what the noise's model leaves of it; near 0
             where the model is right.
         effective_samples: `(P,)`, effective sample size that the quantiles rest on.
         diagnostics: whether the intervals are to be relied on, columns of `fits`, `(P,)` each.
         draws: parameters, `(P, draws, n)`, SI units: as correlated as a recording leaves them.
         chains: that the draws are of, one after the other; 1 where draws are independent.
+        noise: which kind of noise they rest on, and its evidence.
         make_fan: simulates the fan of trajectories.
         origin: where drivers who were not recorded come from: the population, or as the prior has
             them.
@@ -82,18 +99,25 @@ class ParameterIntervals(DriverPosteriors):
     contraction: Tensor
     noise_scale: Tensor
     noise_correlation: Tensor
+    noise_gain: Tensor
     noise_left: Tensor
     effective_samples: Tensor
     diagnostics: Mapping[str, Tensor]
     draws: Tensor
     chains: int
+    noise: ChosenNoise
     make_fan: Callable[[], Fan]
     origin: Population | PriorDrivers
     seed: int
 
-    def columns(self) -> dict[str, NDArray[np.float64]]:
+    @cached_property
+    def fan(self) -> Fan:
+        """The fan of trajectories."""
+        return self.make_fan()
+
+    def columns(self) -> dict[str, NDArray[Any]]:
         """Returns columns for a row per driver: `median_NAME`, `noise_scale` and so on."""
-        found = {}
+        found: dict[str, NDArray[Any]] = {}
         for kind in ("median", "low", "high", "contraction"):
             for number, name in enumerate(self.names):
                 found[f"{kind}_{name}"] = getattr(self, kind)[:, number].numpy()
@@ -101,10 +125,13 @@ class ParameterIntervals(DriverPosteriors):
             found[kind] = getattr(self, kind).numpy()
         for kind, values in self.diagnostics.items():
             found[kind] = values.numpy()
+        found["noise"] = np.full(len(self.low), self.noise.name, dtype=object)
+        for kind, values in self.fan.check(self.seed).items():
+            found[kind] = values.numpy()
         return found
 
     def tables(self, ids: Sequence[str]) -> dict[str, pd.DataFrame]:
-        """Returns `posterior`, draws of each driver's parameters, `prior` and `fan`.
+        """Returns `posterior`, draws of each driver's parameters, `prior`, `fan` and `noise`.
 
         Where a population was asked for, `population`, new drivers of it, stands for `prior`.
         """
@@ -119,7 +146,19 @@ class ParameterIntervals(DriverPosteriors):
         values.insert(len(values.columns) - len(columns), "draw", draw)
         new = pd.DataFrame(self.draw_drivers(NEW_DRIVERS, self.seed).numpy(), columns=columns)
         name = "population" if isinstance(self.origin, Population) else "prior"
-        return {"posterior": values, "fan": self.make_fan().table(ids), name: new}
+        return {
+            "posterior": values,
+            "fan": self.fan.table(ids),
+            "noise": self.noise.table(ids),
+            name: new,
+        }
+
+    def inference_data(self, ids: Sequence[str], model: DrivingModel) -> DataTree:
+        # xarray is imported by those alone who ask for it.
+        from cfx_posteriors.netcdf import inference_data
+
+        fits = pd.DataFrame(self.columns(), pd.Index(ids, name="pair_id"))
+        return inference_data(self.tables(ids), fits, model)
 
     def draw_drivers(self, count: int, seed: int) -> Tensor:
         return self.origin.draw(count, seed=seed)
@@ -156,11 +195,22 @@ class LaplaceMethod(PosteriorMethod):
         best: Tensor,
         settings: CalibrationSettings,
     ) -> ParameterIntervals:
-        posterior = posterior_of(solver, batch, last, settings)
+        with threads.one_thread():
+            return self._found(solver, batch, last, best, settings)
+
+    def _found(
+        self,
+        solver: Solver,
+        batch: PairBatch,
+        last: Tensor,
+        best: Tensor,
+        settings: CalibrationSettings,
+    ) -> ParameterIntervals:
+        noise = choose_noise(solver, batch, last, best, settings)
+        posterior = noise.posterior
         origin = PriorDrivers(solver.space, posterior.prior)
-        normal = laplace(posterior, _starts(solver, posterior, best))
-        found = self.draws_of(solver, posterior, _sampled(solver, posterior, normal))
-        return _intervals(solver, batch, last, settings, (posterior, normal.mode, origin, found))
+        found = self.draws_of(solver, posterior, _sampled(solver, posterior, noise.normal))
+        return _intervals(solver, batch, last, noise, (posterior, noise.normal.mode, origin, found))
 
     def draws_of(self, solver: Solver, posterior: Posterior, sampled: Sampled) -> Sampled | Chains:
         """Returns the draws that stand for the posterior, of weighted samples of it."""
@@ -206,12 +256,18 @@ class SbiMethod(PosteriorMethod):
         # sbi takes seconds to import.
         from cfx_posteriors.neural import learn
 
-        posterior = posterior_of(solver, batch, last, settings)
+        if settings.noise not in {"chosen", "trajectory"}:
+            raise ConfigError(
+                f"calibration.noise={settings.noise}: the network of calibration.posterior=sbi"
+                " learns from closed loops with autoregressive errors; set"
+                " calibration.noise=trajectory, or another posterior"
+            )
+        alone = settings.model_copy(update={"noise": "trajectory"})
+        noise = choose_noise(solver, batch, last, best, alone)
+        posterior = noise.posterior
         origin = PriorDrivers(solver.space, posterior.prior)
         found = learn(posterior, _shares(), seed=solver.seed, memory=solver.memory)
-        return _intervals(
-            solver, batch, last, settings, (posterior, found.likeliest, origin, found)
-        )
+        return _intervals(solver, batch, last, noise, (posterior, found.likeliest, origin, found))
 
 
 class HierarchicalMethod(PosteriorMethod):
@@ -228,21 +284,89 @@ class HierarchicalMethod(PosteriorMethod):
         best: Tensor,
         settings: CalibrationSettings,
     ) -> ParameterIntervals:
-        alone = posterior_of(solver, batch, last, settings)
-        population, posterior, normal = fit_population(alone, _starts(solver, alone, best))
-        sampled = _sampled(solver, posterior, normal)
-        return _intervals(
-            solver, batch, last, settings, (posterior, normal.mode, population, sampled)
-        )
+        with threads.one_thread():
+            noise = choose_noise(solver, batch, last, best, settings)
+
+        def draw(posterior: Posterior, normal: Normal) -> Tensor:
+            return _sampled(solver, posterior, normal).draws
+
+        with threads.one_thread():
+            population, posterior, normal = fit_population(noise.posterior, noise.normal, draw)
+            sampled = _sampled(solver, posterior, normal)
+        return _intervals(solver, batch, last, noise, (posterior, normal.mode, population, sampled))
+
+
+@dataclass(frozen=True)
+class ChosenNoise:
+    """Where noise enters a recording, and how evident that is.
+
+    Attributes:
+        posterior: with the kind of highest evidence, of all drivers together.
+        normal: Laplace's approximation of it.
+        evidence: log evidence of each kind that was tried, `(P,)` each.
+    """
+
+    posterior: Posterior
+    normal: Normal
+    evidence: Mapping[str, Tensor]
+
+    @property
+    def name(self) -> str:
+        """As after `calibration.noise=`."""
+        return self.posterior.kind.name
+
+    def table(self, ids: Sequence[str]) -> pd.DataFrame:
+        """Returns the table `noise`, a row for each pair and kind.
+
+        Args:
+            ids: of the pairs.
+        """
+        parts = []
+        for name, values in self.evidence.items():
+            of_kind = {"pair_id": ids, "noise": name, "log_evidence": values.numpy()}
+            parts.append(pd.DataFrame({**of_kind, "chosen": name == self.name}))
+        return pd.concat(parts, ignore_index=True)
+
+
+def choose_noise(
+    solver: Solver, batch: PairBatch, last: Tensor, best: Tensor, settings: CalibrationSettings
+) -> ChosenNoise:
+    """Returns posteriors with the kind of noise that `calibration.noise` names.
+
+    Of all kinds that with the highest evidence, summed over drivers: noise is of the recording and
+    of what people have in common, and one driver says too little. A simulator that cannot start
+    again from a state has one closed loop alone.
+
+    Args:
+        solver, batch, last, best, settings: as of `PosteriorMethod.find`.
+    """
+    names: tuple[str, ...] = (settings.noise,)
+    if settings.noise == "chosen":
+        names = NOISE_KINDS
+        if not isinstance(solver.stepper, MemoryStepper):
+            names = ("trajectory",)
+    found: list[tuple[Posterior, Normal]] = []
+    evidence = {}
+    for name in names:
+        posterior = posterior_of(solver, batch, last, settings, name)
+        normal = laplace(posterior, _starts(solver, posterior, best))
+        evidence[name] = log_evidence(posterior, normal)
+        found.append((posterior, normal))
+    totals = torch.stack(list(evidence.values())).sum(1)
+    posterior, normal = found[int(totals.argmax())]
+    return ChosenNoise(posterior, normal, evidence)
 
 
 def _starts(solver: Solver, posterior: Posterior, best: Tensor) -> Tensor:
-    """Returns logits at which searches start, `(P, S, n)`: the point estimates among them."""
+    """Returns where searches start, `(P, S, s)`: the point estimates among them."""
     space = solver.space
     best = squashed(space.to_unit(best.to("cpu", torch.float64)))
     default = squashed(space.to_unit(space.defaults())).expand_as(best)
     likely = likely_starts(posterior, solver.seed)
-    return torch.cat([best[:, None], default[:, None], likely], dim=1)
+    known = torch.stack([best, default], dim=1)
+    # A gain that is estimated starts in the middle.
+    known = torch.cat([known, known.new_zeros((*known.shape[:2], posterior.kind.simulated))], -1)
+    return torch.cat([known, likely], dim=1)
 
 
 def _shares() -> Tensor:
@@ -257,13 +381,14 @@ def _intervals(
     solver: Solver,
     batch: PairBatch,
     last: Tensor,
-    settings: CalibrationSettings,
+    noise: ChosenNoise,
     found: tuple[Posterior, Tensor, Population | PriorDrivers, Sampled | Chains | Learned],
 ) -> ParameterIntervals:
     """Returns the intervals of each driver's parameters.
 
     Args:
-        solver, batch, last, settings: as of `PosteriorMethod.find`.
+        solver, batch, last: as of `PosteriorMethod.find`.
+        noise: that posteriors rest on.
         found: the posteriors, their likeliest coordinates `(P, d)`, where new drivers come from,
             and samples.
     """
@@ -274,12 +399,13 @@ def _intervals(
     width = (sampled.quantiles[:, 2] - sampled.quantiles[:, 0]) / (prior[2] - prior[0])
     values = space.from_unit(torch.sigmoid(sampled.quantiles))
     low, median, high = values.unbind(1)
-    scale, correlation, left = _noise(posterior, likeliest)
+    n = len(space)
 
     def make_fan() -> Fan:
-        whole = posterior_of(solver, batch, batch.lengths - 1, settings)
+        # It steps a few frames at a time: too little work in each call for compiled code.
+        whole = segments_of(solver, batch, batch.lengths - 1, solver.stepper)
         return fan_of(
-            replace(whole, stride=posterior.stride),
+            replace(posterior, segments=whole),
             last.cpu(),
             sampled.draws[:, :: sampled.draws.shape[1] // DRAWS],
             shares,
@@ -293,13 +419,12 @@ def _intervals(
         median,
         high,
         contraction=1.0 - width,
-        noise_scale=scale,
-        noise_correlation=correlation,
-        noise_left=left,
+        **_of_noise(posterior, likeliest),
         effective_samples=sampled.effective,
         diagnostics=sampled.diagnostics,
-        draws=space.from_unit(torch.sigmoid(sampled.draws[..., : len(space)])),
+        draws=space.from_unit(torch.sigmoid(sampled.draws[..., :n])),
         chains=sampled.chains,
+        noise=noise,
         make_fan=make_fan,
         origin=origin,
         seed=solver.seed,
@@ -307,7 +432,7 @@ def _intervals(
 
 
 def posterior_of(
-    solver: Solver, batch: PairBatch, last: Tensor, settings: CalibrationSettings
+    solver: Solver, batch: PairBatch, last: Tensor, settings: CalibrationSettings, kind: str
 ) -> Posterior:
     """Returns the posterior of drivers on their recordings up to a last frame, on the CPU.
 
@@ -316,26 +441,46 @@ def posterior_of(
         batch: P pairs.
         last: `(P,)`, the last frame that is compared; simulated from frame 0 in one closed loop.
         settings: prior and noise.
+        kind: where noise enters, as after `calibration.noise=`, but for `chosen`.
+    """
+    segments = segments_of(solver, batch, last, solver.stepper.for_work(_WORK))
+    stride = max(1, round(settings.noise_step_s / solver.stepper.dt))
+    return Posterior(
+        segments,
+        ParameterPrior.of(solver.space, settings.prior),
+        noise_kind(kind, settings.noise_order),
+        min(stride, segments.steps),
+    )
+
+
+def segments_of(solver: Solver, batch: PairBatch, last: Tensor, stepper: Stepper) -> SegmentLosses:
+    """Returns recordings up to a last frame, on the CPU in float64.
+
+    Args:
+        solver: whose objective counts.
+        batch: P pairs.
+        last: `(P,)`, the last frame that is compared.
+        stepper: that simulates them.
     """
     pair = torch.arange(len(batch), device=batch.lengths.device)
     last = last.to(pair.device)
-    cut = SegmentLosses.of_segments(
-        solver.stepper.for_work(_WORK), solver.objective, batch, pair, pair * 0, last
-    )
+    cut = SegmentLosses.of_segments(stepper, solver.objective, batch, pair, pair * 0, last)
     measured = Segments(*(values.to("cpu", torch.float64) for values in cut.segments))
-    stride = max(1, round(settings.noise_step_s / solver.stepper.dt))
-    return Posterior(
-        SegmentLosses(cut.stepper, cut.objective, measured),
-        ParameterPrior.of(solver.space, settings.prior),
-        settings.noise_order,
-        min(stride, cut.steps),
-    )
+    return SegmentLosses(cut.stepper, cut.objective, measured)
 
 
-def _noise(posterior: Posterior, likeliest: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Returns scale, correlation and what is left of it at coordinates `(P, d)`, `(P,)` each."""
-    n = len(posterior.space)
+def _of_noise(posterior: Posterior, likeliest: Tensor) -> dict[str, Tensor]:
+    """Returns what coordinates `(P, d)` say of the noise, and what it leaves, `(P,)` each."""
     residual = posterior.residual(likeliest[:, None])[..., 0]
     left = (residual[1:] * residual[:-1]).sum(0) / residual.square().sum(0).clamp(min=1e-300)
-    noise = likeliest[:, n:]
-    return noise[:, -1].exp(), noise[:, 0].tanh(), left
+    own = likeliest[:, posterior.simulated :]
+    gain = posterior.gain(likeliest[:, None])
+    correlation = torch.zeros_like(left)
+    if posterior.order:
+        correlation = own[:, 0].tanh()
+    return {
+        "noise_scale": own[:, -1].exp(),
+        "noise_correlation": correlation,
+        "noise_gain": torch.zeros_like(left) if gain is None else gain[:, 0],
+        "noise_left": left,
+    }

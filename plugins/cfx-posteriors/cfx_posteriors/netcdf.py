@@ -39,6 +39,9 @@ _DIAGNOSTICS = {
     "effective_samples": "effective sample size that the draws rest on",
     "noise_scale": "what each step of the noise adds",
     "noise_correlation": "of the noise with itself one step later",
+    "noise_gain": "the driver's own share of the noise, 0 to 1",
+    "held": "share of the held-out steps that forecasts hold; 0.9 is right",
+    "held_chance": "below 0.05 forecasts miss more of the held-out part than chance allows",
 }
 
 
@@ -62,7 +65,8 @@ class NetcdfExport(ExportFormat):
                 " calibration.posterior=laplace, nuts, sbi or hierarchical"
             )
         node = job_folder.read_yaml(folder / "config.yaml")["model"]
-        tree = inference_data(tables, cast(DrivingModel, registry.create("model", node)))
+        fits = tables["fits"].query("method == 'driver_specific'").set_index("pair_id")
+        tree = inference_data(tables, fits, cast(DrivingModel, registry.create("model", node)))
         with tempfile.TemporaryDirectory(prefix="cfx-") as name:
             path = Path(name, NAME)
             tree.to_netcdf(path, engine="h5netcdf")
@@ -76,12 +80,15 @@ class NetcdfExport(ExportFormat):
         ]
 
 
-def inference_data(tables: Mapping[str, pd.DataFrame], model: DrivingModel) -> xr.DataTree:
-    """Returns a job's posteriors as labelled arrays.
+def inference_data(
+    tables: Mapping[str, pd.DataFrame], fits: pd.DataFrame, model: DrivingModel
+) -> xr.DataTree:
+    """Returns posteriors as labelled arrays.
 
     Args:
-        tables: `posterior` and `fits` of a job, and `prior` or `population`.
-        model: of the job.
+        tables: `posterior`, and `prior` or `population`.
+        fits: diagnostics, a row per pair_id.
+        model: whose parameters they are.
 
     Returns:
         `posterior`: (chain, draw, pair); `prior` or `population`: (chain, draw), drivers who were
@@ -94,7 +101,7 @@ def inference_data(tables: Mapping[str, pd.DataFrame], model: DrivingModel) -> x
     for kind in ("prior", "population"):
         if kind in tables:
             groups[kind] = _dataset(tables[kind], names, model, None)
-    rows = tables["fits"].query("method == 'driver_specific'").set_index("pair_id").loc[pairs]
+    rows = fits.loc[pairs]
     diagnostics = {}
     for name, meaning in _DIAGNOSTICS.items():
         if name not in rows:

@@ -193,19 +193,19 @@ class _Reader:
 
     def __call__(self, errors: Tensor) -> Tensor:
         """Returns what is read of errors `(K, P, q)`, `(P, q, 3 n + 2 m + 1)`."""
-        counted, order = self.posterior.counted, self.posterior.order
-        away = (errors - self.mean[..., None]) * counted
+        scored, order = self.posterior.scored, self.posterior.order
+        away = (errors - self.mean[..., None]) * self.posterior.counted
         identity = torch.eye(self.slopes.shape[-1], dtype=away.dtype)
         found = []
         for correlation in away.new_tensor(_CORRELATIONS):
-            slopes = noise.filtered(self.slopes, correlation[None]) * counted
-            white = noise.filtered(away, correlation[None]) * counted
+            slopes = noise.filtered(self.slopes, correlation[None]) * scored
+            white = noise.filtered(away, correlation[None]) * scored
             slopes = slopes / self.scale[:, None]
             white = white / self.scale[:, None]
             precision = torch.einsum("kpi,kpj->pij", slopes, slopes) + identity
             found.append(torch.linalg.solve(precision, torch.einsum("kpi,kpq->piq", slopes, white)))
         left = away - torch.einsum("kpi,piq->kpq", self.slopes, found[0])
-        products = noise.lagged_products(left, counted, order)
+        products = noise.lagged_products(left, scored, order)
         lags = products[..., 0, 1:] / products[..., :1, 0].clamp(min=1e-12)
         about = noise.first_noise(products, self.posterior.count)
         return torch.cat([*(one.mT for one in found), about, lags], dim=-1)
@@ -348,7 +348,7 @@ def _first_region(posterior: Posterior, seed: int, memory: int) -> _Region:
     logits = posterior.prior.draw(FIRST, n, seed=seed).expand(drivers, -1, -1)
     found, densities = [], []
     for part in torch.split(logits, _at_once(posterior, memory), dim=1):
-        products = noise.lagged_products(posterior.errors(part), posterior.counted, posterior.order)
+        products = posterior.products(part)
         about = noise.first_noise(products, posterior.count)
         found.append(torch.cat([part, about], dim=-1))
         densities.append(noise.log_density(products, posterior.count, about))

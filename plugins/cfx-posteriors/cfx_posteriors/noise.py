@@ -1,13 +1,26 @@
-"""Autoregressive noise: how the errors of a simulated trajectory hang together in time.
+"""Noise: where it enters, and how errors hang together in time.
 
+A recording is predicted a step of the noise at a time (1 s, say). After each step the predicted
+state moves towards the measured one by a share, the gain k, and drives on from there:
+
+    e_t = predicted minus measured signal after step t
+    state after step t = predicted + k (measured - predicted), of position and speed
     e_t = phi_1 e_(t-1) + ... + phi_m e_(t-m) + s w_t,      w_t standard normal
 
-The simulation starts from the measured state, so that errors before its first step are 0.
+With k = 0 the prediction is one closed loop: errors are of the measurement, or of a trajectory that
+keeps away from the measured one for a while. With k = 1 it starts anew from each measured state:
+errors are what the driver's acceleration added within a step (their own action noise). Between
+them both enter, and k says which share of an error is the driver's: it is the gain of the Kalman
+filter in its steady state, and the model is in innovations form, whose errors are white where m and
+k are right (L. Ljung 1999, *System identification*, 2nd ed., section 4.3; errors of the output and
+of the equation are its two ends). One gain for position and speed is a simplification. Errors
+before the first step are 0, since the simulation starts from the measured state.
 
 C. Zhang and L. Sun (2024), *Bayesian calibration of the intelligent driver model*, IEEE
 Transactions on Intelligent Transportation Systems 25(8): errors of car-following models are
-correlated over seconds, and who takes them for independent believes too much. Differences: errors
-are of speed or gap in closed loop, and coefficients are kept stationary.
+correlated over seconds, and who takes them for independent believes too much. Theirs are errors of
+the acceleration, k = 1 here. Differences: errors are of speed or gap after a step, not after each
+frame, and coefficients are kept stationary.
 
 Shapes: `*batch` are any leading dimensions, m is the order, K steps.
 """
@@ -15,17 +28,72 @@ Shapes: `*batch` are any leading dimensions, m is the order, K steps.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 from torch.nn.functional import softplus
 
-SHAPE, RATE = 1.0, 0.2**2
+SHAPE, RATE = 1.0, 0.03**2
 """Prior of s squared: inverse gamma, as much as two steps with errors of 0.03 (m/s, or m) say. A
-recording without noise so keeps a little of it."""
+recording without noise so keeps a little of it. With errors of 0.2 intervals of Krauss's drivers,
+who correct an error of their acceleration in the next step, held 99 %."""
 
 _LEAST_DENSITY = -1e12
 """Logarithm of the density where a simulation diverges: finite, so that slopes stay numbers."""
+
+
+NOISE_KINDS = ("trajectory", "measurement", "acceleration", "both")
+"""Of which `calibration.noise=chosen` takes the most evident one."""
+
+
+class NoiseKind(NamedTuple):
+    """Where noise enters.
+
+    Attributes:
+        name: as after `calibration.noise=`.
+        gain: k; None: estimated.
+        order: m; 0: white.
+    """
+
+    name: str
+    gain: float | None
+    order: int
+
+    @property
+    def simulated(self) -> int:
+        """Coordinates besides the model's parameters that predictions depend on: those of k."""
+        return int(self.gain is None)
+
+    @property
+    def log_constant(self) -> float:
+        """What the densities of its parameters a priori leave out, for comparing kinds.
+
+        Partial autocorrelations are uniform from -1 to 1.
+        """
+        return -self.order * math.log(2.0)
+
+
+def noise_kind(name: str, order: int) -> NoiseKind:
+    """Returns the kind of noise of a name, such as `acceleration`.
+
+    Args:
+        name: as after `calibration.noise=`, but for `chosen`.
+        order: m, of kinds whose errors are autoregressive.
+    """
+    if name == "measurement":
+        return NoiseKind(name, 0.0, 0)
+    gains = {"trajectory": 0.0, "acceleration": 1.0, "both": None}
+    return NoiseKind(name, gains[name], order)
+
+
+def gain_after(gain: Tensor, step: int) -> Tensor:
+    """Returns the gain after the t-th step, of the one that it comes to.
+
+    The simulation starts from a state that was measured once. With k = 0 the gain is that of the
+    mean of all measurements so far, 1 / (t + 1).
+    """
+    return gain + (1.0 - gain) / (step + 1)
 
 
 def coefficients(squashed: Tensor) -> Tensor:
@@ -117,7 +185,7 @@ def scale_gamma(products: Tensor, count: Tensor, squashed: Tensor) -> tuple[Tens
         squashed: `(*batch, m)`, as in `coefficients`.
     """
     phi = coefficients(squashed)
-    whole = torch.cat([torch.ones_like(phi[..., :1]), -phi], dim=-1)
+    whole = torch.cat([phi.new_ones((*phi.shape[:-1], 1)), -phi], dim=-1)
     squares = (whole[..., :, None] * products * whole[..., None, :]).sum((-2, -1))
     return 0.5 * count + SHAPE, 0.5 * squares + RATE
 
@@ -158,8 +226,9 @@ def first_noise(products: Tensor, count: Tensor) -> Tensor:
         products, count: as of `scale_gamma`.
     """
     order = products.shape[-1] - 1
-    correlation = products[..., 0, 1] / products[..., 1, 1].clamp(min=1e-12)
     squashed = products.new_zeros((*products.shape[:-2], order))
-    squashed[..., 0] = torch.atanh(correlation.clamp(-0.95, 0.999))
+    if order:
+        correlation = products[..., 0, 1] / products[..., 1, 1].clamp(min=1e-12)
+        squashed[..., 0] = torch.atanh(correlation.clamp(-0.95, 0.999))
     shape, rate = scale_gamma(products, count, squashed)
     return torch.cat([squashed, 0.5 * (rate / shape).log()[..., None]], dim=-1)

@@ -30,6 +30,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
+from cfx.plugin import Task, threads
 from cfx_posteriors.density import Posterior
 from cfx_posteriors.importance import Sampled
 
@@ -47,7 +48,7 @@ with contextlib.redirect_stderr(sys.__stderr__):
     from blackjax.mcmc.nuts import NUTSInfo
 
 CHAINS = 4
-WARM_UP, DRAWS = 200, 800
+WARM_UP, DRAWS = 200, 500
 """Draws of each chain: those that find coordinates and the length of a step, and those kept."""
 
 _AT_ONCE = 25
@@ -62,8 +63,9 @@ _FIRST_LENGTH = 0.5
 _ACCEPTED = 0.8
 """Acceptance that the length of a step aims at."""
 
-_DOUBLINGS = 7
-"""Of a tree, at most: 127 steps."""
+_DOUBLINGS = 5
+"""Of a tree, at most: 31 steps. In coordinates in which the posterior is about standard normal
+longer trees bring little, and every chain of every driver waits for the longest."""
 
 _SHARES = (0.01, 0.03, 0.1, 0.25, 0.5, 0.75, 0.9, 0.97, 0.99)
 """Of samples, at which a coordinate is that of a normal distribution."""
@@ -216,7 +218,9 @@ class _Density:
         if len(moved):
             if not torch.equal(moved, self.driving):
                 self.driving, self.part = moved, self.posterior.take(moved)
-            self.answer[moved] = self.coordinates.density(self.part, places, moved)
+            # Threads are counted for each thread that calls PyTorch, and this is JAX's.
+            with threads.one_thread():
+                self.answer[moved] = self.coordinates.density(self.part, places, moved)
             self.last.copy_(places)
         return self.answer.numpy()[..., None].view(np.uint32)
 
@@ -296,14 +300,18 @@ def _walked(posterior: Posterior, sampled: Tensor, seed: int) -> tuple[Tensor, T
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         begin, go_on = _sampler(density)
         now = begin(starts)
-        for number in range(every):
-            if number == half:
-                seen = torch.tensor(found[-1].place).flatten(1, 2)
-                density.change(density.coordinates.relearned(sampled, seen))
-                now = begin(starts)
-            keys = jax.random.split(jax.random.fold_in(key, number), (shape[0], _AT_ONCE, CHAINS))
-            now, steps = go_on(keys, now, number < learning)
-            found.append(_Step(*map(np.asarray, steps)))
+        title = f"Sampling {CHAINS} chains of each of {shape[0]} drivers"
+        with Task(title, every * _AT_ONCE) as task:
+            for number in range(every):
+                if number == half:
+                    seen = torch.tensor(found[-1].place).flatten(1, 2)
+                    density.change(density.coordinates.relearned(sampled, seen))
+                    now = begin(starts)
+                folded = jax.random.fold_in(key, number)
+                keys = jax.random.split(folded, (shape[0], _AT_ONCE, CHAINS))
+                now, steps = go_on(keys, now, number < learning)
+                found.append(_Step(*map(np.asarray, steps)))
+                task.advance(_AT_ONCE)
     coordinates = density.coordinates
     # Draws come before chains.
     places, diverges = (

@@ -45,12 +45,28 @@ class PriorDraws(ResultTable):
     columns = (Column("parameter_NAME", "as of the parameter", "the parameter"),)
 
 
+class NoiseEvidence(ResultTable):
+    """How evident each kind of noise is."""
+
+    meaning = (
+        "how evident each kind of noise is that was tried: the logarithm of how likely each"
+        " recording is, whatever parameters and noise (`calibration.noise`)"
+    )
+    order = 215
+    columns = (
+        PAIR,
+        Column("noise", "", "where noise enters, as after `calibration.noise=`", "text"),
+        Column("log_evidence", "1", "up to a constant of the pair, that all kinds share"),
+        Column("chosen", "1", "whether intervals rest on this kind", "bool"),
+    )
+
+
 class Fan(ResultTable):
     """What posteriors say of trajectories."""
 
     meaning = (
-        "90 % of the trajectories of each driver's posterior: simulated on the part that was"
-        " calibrated on, then forecasts (`calibration.posterior`)"
+        "90 % of the trajectories of each driver's posterior: predicted without noise on the part"
+        " that was calibrated on, then forecasts with it (`calibration.posterior`)"
     )
     order = 214
     columns = (

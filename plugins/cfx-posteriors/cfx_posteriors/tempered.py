@@ -86,18 +86,18 @@ def tempered(posterior: Posterior, seed: int) -> Tensor:
 
 
 def _first(posterior: Posterior, generator: torch.Generator, seed: int) -> _Crowd:
-    drivers, n = posterior.segments.problems, len(posterior.space)
-    logits = posterior.prior.draw(SAMPLES, n, seed=seed).expand(drivers, -1, -1)
+    drivers = posterior.segments.problems
+    simulated = posterior.prior_draw(SAMPLES, seed=seed).expand(drivers, -1, -1)
     noises = noise.draw(SAMPLES, posterior.order, generator).expand(drivers, -1, -1)
-    places = torch.cat([logits, noises], dim=-1)
+    places = torch.cat([simulated, noises], dim=-1)
     step = torch.full((drivers,), 2.38 / math.sqrt(places.shape[-1]), dtype=torch.float64)
     return _Crowd(places, *_density(posterior, places), torch.zeros_like(step), step)
 
 
 def _density(posterior: Posterior, places: Tensor) -> tuple[Tensor, Tensor]:
     """Returns log densities of prior and likelihood, `(P, N)` each."""
-    n = len(posterior.space)
-    prior = posterior.prior.log_density(places[..., :n]) + noise.prior_log_density(places[..., n:])
+    of_noise = noise.prior_log_density(places[..., posterior.simulated :])
+    prior = posterior.prior_log_density(places) + of_noise
     return prior, posterior(places) - prior
 
 

@@ -15,6 +15,7 @@ from cfx.models.base import DrivingModel
 from cfx.simulation.rollout import MemoryStepper
 from cfx_posteriors import noise
 from cfx_posteriors.density import ParameterPrior, Posterior
+from cfx_posteriors.noise import noise_kind
 from cfx_posteriors.population import Population
 from tests.drives import wavy_pairs
 
@@ -73,4 +74,5 @@ def draw_recordings(
         first + frames - 1,
     )
     truth = torch.cat([logits, torch.atanh(correlation), scale.log()], dim=1)
-    return Drawn(Posterior(segments, prior, order=1, stride=STRIDE), truth, batch)
+    posterior = Posterior(segments, prior, noise_kind("trajectory", order=1), stride=STRIDE)
+    return Drawn(posterior, truth, batch)

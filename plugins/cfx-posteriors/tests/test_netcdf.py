@@ -54,7 +54,7 @@ def test_chains_are_a_dimension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         for chain, own in rows.groupby("chain"):
             np.testing.assert_array_equal(one.sel(chain=chain), own["parameter_t_r"])
         known = fits.query("pair_id == @pair_id").iloc[0]
-        assert known["median_t_r"] == pytest.approx(float(one.median()))
+        assert known["median_t_r"] == pytest.approx(float(one.median()), rel=1e-4)
         r_hat = float(tree["diagnostics"]["r_hat"].sel(pair=pair_id))
         chains = one.transpose("chain", "draw").to_numpy()
         # The largest of all coordinates and of deviations too; by rank, so that units are the same.

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 from cfx.models.krauss import Krauss
-from cfx_posteriors.laplace import laplace
+from cfx_posteriors.density import Posterior
+from cfx_posteriors.importance import sample
+from cfx_posteriors.laplace import Normal, laplace
 from cfx_posteriors.population import Population, fit_population
 
 from .recordings import draw_recordings
@@ -24,7 +26,12 @@ def test_mean_and_covariance_are_found_and_drivers_are_nearer_to_the_truth() -> 
     weak = drawn.posterior
     assert weak.prior.center is not None
     starts = weak.prior.center.expand(60, 1, -1)
-    population, within, normal = fit_population(weak, starts)
+
+    def draw(posterior: Posterior, normal: Normal) -> torch.Tensor:
+        half = torch.tensor([0.5], dtype=torch.float64)
+        return sample(posterior, normal, half, seed=0, memory=1 << 30).draws
+
+    population, within, normal = fit_population(weak, laplace(weak, starts), draw)
     torch.testing.assert_close(population.mean, TRUE.mean, atol=0.15, rtol=0)
     torch.testing.assert_close(population.covariance, TRUE.covariance, atol=0.15, rtol=0)
     assert within.prior.center is population.mean

@@ -62,6 +62,8 @@ BESIDE, IN_SUMO = 6, 2
 GROUP, SEEDS = 8, {"krauss": (20,), "idm": (20, 22), "w99": (22,)}
 FRAMES, AFTER_S = 600, (1, 5, 10, 30)
 AHEAD_S = (1, 2, 3, 5, 10)
+NOISE = "trajectory"
+"""Of all but `simulated`: what chains, networks and weighted samples are compared on."""
 AFTER = ", ".join(map(str, AFTER_S))
 
 
@@ -156,7 +158,7 @@ def recording(name: str) -> Iterator[str]:
             low = float(found.low[:, column].median())
             high = float(found.high[:, column].median())
             rows.append(f"{parameter} {known:.0%} ({low:.2g} to {high:.2g})")
-        reliable = float((found.pareto_k <= 0.7).double().mean())
+        reliable = float((found.diagnostics["pareto_k"] <= MAX_PARETO_K).double().mean())
         yield (
             f"{type(model).__name__}, {len(batch)} pairs, {seconds or 'all'} s, reliable"
             f" {reliable:.0%}, {spent:.1f} CPU s: {', '.join(rows)}"
@@ -173,7 +175,7 @@ def chains(name: str) -> Iterator[str]:
     batch = PairBatch.of(pairs, dtype=torch.float64)
     solver = Solver(MemoryStepper(model, batch.dt), RandomSearch(), seed=0)
     settings = CalibrationSettings(posterior="laplace")
-    posterior = posterior_of(solver, batch, batch.lengths - 1, settings)
+    posterior = posterior_of(solver, batch, batch.lengths - 1, settings, NOISE)
     n, d = len(posterior.space), posterior.dimensions
     started = time.process_time()
     normal = laplace(posterior, likely_starts(posterior, seed=0))
@@ -249,7 +251,7 @@ def recorded(name: str, drivers: int) -> Posterior:
     batch = PairBatch.of(pairs, dtype=torch.float64)
     solver = Solver(MemoryStepper(MODELS[name], batch.dt), RandomSearch(), seed=0)
     settings = CalibrationSettings(posterior="nuts")
-    return posterior_of(solver, batch, batch.lengths - 1, settings)
+    return posterior_of(solver, batch, batch.lengths - 1, settings, NOISE)
 
 
 def covered(name: str) -> Iterator[str]:
@@ -380,7 +382,7 @@ def sumo(name: str) -> Iterator[str]:
     ways = (("laplace", MemoryStepper(model, batch.dt)), ("sbi", simulated), ("laplace", simulated))
     for way, stepper in ways:
         solver = Solver(stepper, RandomSearch(), seed=0)
-        posterior = posterior_of(solver, batch, batch.lengths - 1, settings)
+        posterior = posterior_of(solver, batch, batch.lengths - 1, settings, NOISE)
         began = time.perf_counter()
         found: Learned | Sampled
         if way == "sbi":
@@ -499,10 +501,10 @@ def forecasts(name: str) -> Iterator[str]:
     settings = CalibrationSettings(posterior="laplace")
     last = batch.lengths - 1
     known = (0.8 * last).long()
-    alone = posterior_of(solver, batch, known, settings)
+    alone = posterior_of(solver, batch, known, settings, NOISE)
     starts = likely_starts(alone, seed=0)
     normal = laplace(alone, starts)
-    _, within, pooled = fit_population(alone, starts)
+    _, within, pooled = fit_population(alone, normal)
     drawn = {
         "likeliest": normal.mode[:, None].expand(-1, DRAWS, -1),
         "posterior": sample(alone, normal, SHARES, seed=0, memory=1 << 30).draws,
@@ -511,7 +513,7 @@ def forecasts(name: str) -> Iterator[str]:
             within, pooled, SHARES, seed=0, memory=1 << 30
         ).draws,
     }
-    whole = posterior_of(solver, batch, last, settings)
+    whole = posterior_of(solver, batch, last, settings, NOISE)
     for label, draws in drawn.items():
         errors = whole.errors(draws[..., : len(model.space)])
         crps, held = forecast_scores(errors, draws, known // whole.stride, last // whole.stride)
