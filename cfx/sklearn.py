@@ -103,7 +103,10 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         """
         check_is_fitted(self)
         table = _table(X)
-        drive = simulate(self.model, self.parameters_, _pairs(table), **(self.settings or {}))
+        # Those of calibration, such as the optimizer's, do nothing where nobody calibrates.
+        kept = [key for key in self.settings or {} if key.startswith(("model.", "data."))]
+        of_model = {key: (self.settings or {})[key] for key in kept}
+        drive = simulate(self.model, self.parameters_, _pairs(table), **of_model)
         order = row_order(table)
         speed = np.empty(len(order))
         speed[order] = drive["speed"]

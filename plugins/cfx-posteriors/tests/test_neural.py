@@ -28,6 +28,7 @@ from cfx_posteriors import neural
 SHARES = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
 
 
+@pytest.mark.slow
 def test_samples_are_the_posterior() -> None:
     posterior = draw_recordings(Krauss(), 2, frames=300).posterior
     found = neural.learn(posterior, SHARES, seed=0, memory=1 << 30)

@@ -48,6 +48,7 @@ class FmiExport(ExportFormat):
 
     def write(self, run: str, output: Path | None) -> list[str]:
         output = output or default_output(run, NAME)
+        compiler = _compiler()
         step = step_of(run)
         graph = graph_of(step, run, one_driver=True)
         signals = signals_of(step)
@@ -59,7 +60,7 @@ class FmiExport(ExportFormat):
         about = f"A driver that cfx trained, who decides every {step.dt:g} s: {run}"
         description = description_of(signals, step.dt, token, about, bool(step.noise_width))
         with tempfile.TemporaryDirectory(prefix="cfx-") as folder:
-            library = _compiled(sources, Path(folder))
+            library = _compiled(compiler, sources, Path(folder))
             difference = largest_difference(step, _in_c(library, graph))
             check_difference(run, "C code", difference)
             data = _packed(description, sources, library)
@@ -72,25 +73,33 @@ class FmiExport(ExportFormat):
         ]
 
 
-def _compiled(sources: Mapping[str, str], folder: Path) -> Path:
+def _compiler() -> str:
+    """Returns the C compiler of this machine.
+
+    Raises:
+        NotInstalledError: there is none.
+    """
+    for name in _COMPILERS:
+        path = shutil.which(name)
+        if path is not None:
+            return path
+    raise NotInstalledError(
+        f"cfx export --to fmi needs a C compiler ({', '.join(_COMPILERS)}), and there is none;"
+        " install one (Debian: apt install gcc)"
+    )
+
+
+def _compiled(compiler: str, sources: Mapping[str, str], folder: Path) -> Path:
     """Compiles the unit for this machine.
 
     Args:
+        compiler: its path.
         sources: by file name.
         folder: where.
 
     Returns:
         The library, in a folder called as FMI calls this machine.
-
-    Raises:
-        NotInstalledError: there is no C compiler.
     """
-    compiler = next(filter(None, map(shutil.which, _COMPILERS)), None)
-    if compiler is None:
-        raise NotInstalledError(
-            f"cfx export --to fmi needs a C compiler ({', '.join(_COMPILERS)}), and there is none;"
-            " install one (Debian: apt install gcc)"
-        )
     system, ending = _LIBRARIES[platform.system()]
     machine = platform.machine().lower()
     target = folder / f"{_MACHINES.get(machine, machine)}-{system}" / f"{IDENTIFIER}.{ending}"
