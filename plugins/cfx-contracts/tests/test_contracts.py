@@ -14,8 +14,14 @@ from cfx.errors import NotInstalledError, PluginError
 from cfx.models.krauss import Krauss
 from cfx_contracts import check_contract, contract_for
 
-SLOW = {("protocol", "forecast"), ("protocol", "traffic"), ("engine", "local"), ("engine", "dask")}
-"""Those that take long even with the settings of their `trial`."""
+SLOW = {
+    ("protocol", "forecast"),
+    ("protocol", "traffic"),
+    ("engine", "local"),
+    ("engine", "dask"),
+    ("learner", "best_of"),
+}
+"""Those that take long even with the settings of their `trial`; `best_of` is checked beside it."""
 
 FURTHER: dict[tuple[str, str], dict[str, Any]] = {("optimizer", "botorch"): {"tolerance": 0.1}}
 """What few evaluations make harder."""

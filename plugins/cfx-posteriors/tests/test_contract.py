@@ -38,8 +38,8 @@ def found_by(name: str, drawn: Drawn) -> ParameterIntervals:
     return found
 
 
-SLOW = {"nuts"}
-"""JAX compiles for seconds."""
+SLOW = {"nuts", "sbi"}
+"""JAX compiles for seconds, and a network is trained."""
 NAMES = [
     pytest.param(entry.name, marks=[pytest.mark.slow] if entry.name in SLOW else [])
     for entry in registry.entries("posterior")
