@@ -164,6 +164,9 @@ def _of_pairs(
         names = listed([f"'{name}'" for name, _ in alike], _SHOWN)
         typical = sorted(alike, key=_slope)[len(alike) // 2][1]
         parts.append(f"{typical.text(units)} (pairs: {names})")
+    others = len(pairs) - len(broken)
+    if others > len(broken):
+        parts.append(f"the other {others} pairs agree in these units")
     return f"{count}: {'; '.join(parts)}"
 
 
