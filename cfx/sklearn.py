@@ -20,9 +20,8 @@ from cfx.api.pairs import Pairs, read
 from cfx.app.job import steps
 from cfx.calibration.identifiability import losses_of
 from cfx.core.guest import visit
-from cfx.data.frames import Frame, frame_of_source
+from cfx.data.frames import Frame, frame_of_any
 from cfx.data.tidy import row_order
-from cfx.errors import ConfigError, DataError
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.simulation.windows import Split
 
@@ -86,7 +85,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         Raises:
             CfxError: the table is not in the layout, or a parameter is wrong.
         """
-        table = _table(X)
+        table = frame_of_any(X, "X")
         self.parameters_ = self._pooled(_pairs(table))
         self.feature_names_in_ = np.asarray(table.names, dtype=object)
         self.n_features_in_ = len(table.names)
@@ -102,10 +101,11 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
             The followers' speeds in the order of the rows, m/s.
         """
         check_is_fitted(self)
-        table = _table(X)
+        table = frame_of_any(X, "X")
         # Those of calibration, such as the optimizer's, do nothing where nobody calibrates.
-        kept = [key for key in self.settings or {} if key.startswith(("model.", "data."))]
-        of_model = {key: (self.settings or {})[key] for key in kept}
+        settings = self.settings or {}
+        kept = [key for key in settings if key.startswith(("model.", "data."))]
+        of_model = {key: settings[key] for key in kept}
         drive = simulate(self.model, self.parameters_, _pairs(table), **of_model)
         order = row_order(table)
         speed = np.empty(len(order))
@@ -120,7 +120,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
             y: is not read.
         """
         check_is_fitted(self)
-        context, last = self._prepared(_pairs(_table(X)))
+        context, last = self._prepared(_pairs(frame_of_any(X, "X")))
         values = torch.tensor(self.parameters_.to_numpy(dtype=np.float64))
         unit = context.space.to_unit(values.to(context.batch.leader_length))
         candidates = unit.expand(len(context.batch), 1, -1)
@@ -155,28 +155,10 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         return tags
 
 
-def _table(source: Any) -> Frame:
-    """Returns a data frame of any library.
-
-    Raises:
-        DataError: it is none.
-    """
-    try:
-        table = frame_of_source(source)
-    except ConfigError as error:
-        raise DataError(f"X: {error}") from None
-    if table is None:
-        raise DataError(
-            f"X is of type {type(source).__name__}; give a data frame in the tidy layout, a row per"
-            " pair and frame"
-        )
-    return table
-
-
 def _pairs(table: Frame) -> Pairs:
     """Returns the pairs of a table; every row counts.
 
     Raises:
-        DataError: it is not in the tidy layout.
+        CfxError: it is not in the tidy layout.
     """
     return read(table, min_duration=0)

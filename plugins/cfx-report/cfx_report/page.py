@@ -65,8 +65,8 @@ def render(runs: Runs, title: str | None = None) -> str:
     )
 
 
-def _environment(runs: Runs) -> Environment:
-    """Returns what templates are drawn with: the functions that `Section` lists."""
+def templates() -> Environment:
+    """Returns what the templates of this folder are drawn with."""
     import jinja2
 
     environment = jinja2.Environment(
@@ -77,7 +77,12 @@ def _environment(runs: Runs) -> Environment:
         loader=jinja2.FunctionLoader(asset),
     )
     environment.filters["placed"] = placed
+    return environment
 
+
+def _environment(runs: Runs) -> Environment:
+    """Returns what templates are drawn with: the functions that `Section` lists."""
+    environment = templates()
     environment.globals |= {
         "drawn": functools.partial(_drawn, environment),
         "caption": lambda name: drawing.figure_named(name).component.caption,

@@ -23,7 +23,7 @@ from cfx_report.benchmark.board import (
 )
 from cfx_report.benchmark.row import DRIVES
 from cfx_report.inline import PLACE, inline_scripts, inline_svg, security_policy
-from cfx_report.page import asset, placed
+from cfx_report.page import asset, templates
 from cfx_report.section import Cell, Column, Sheet
 
 _SCRIPTS = ("sortable/sortable.min.js", "sortable/sortable.a11y.min.js")
@@ -46,17 +46,9 @@ def write_page(rows: Sequence[Entered], output: Path) -> Path:
 
 def render(rows: Sequence[Entered]) -> str:
     """Returns the page as HTML."""
-    import jinja2
     from markupsafe import Markup
 
-    environment = jinja2.Environment(
-        autoescape=True,
-        undefined=jinja2.StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-        loader=jinja2.FunctionLoader(asset),
-    )
-    environment.filters["placed"] = placed
+    environment = templates()
     blocks: Any = environment.get_template("blocks.html.j2").module
     environment.globals["table"] = blocks.table
     suite = suite_of(rows)
