@@ -12,6 +12,8 @@
 #   make policies                             train the ready-made policies anew from ../shared/data (two hours)
 #   make dist                                 build cfx and the plugins into dist/, install cfx alone into a clean environment, then all, try both
 #   make beside [NAMES=cfx-sumo]              run each distribution's tests where of cfx only the core and what it needs are installed
+#   make results [KEYS="unseen-idm"]          measure what documents state: what docs/results.json lacks, or these jobs anew; then make tables
+#   make tables                               write the numbers of docs/results.json and of policies' cards into the documents
 #   make docs                                 build the site from docs/ and the docstrings into site/; warnings are errors
 #   make tutorials                            run the tutorials and write their pages anew (a quarter of an hour)
 #   make conf                                 write anew what follows from the code: conf/<group>/<name>.yaml, which plugin brings what, the door's page, templates
@@ -30,7 +32,7 @@ PIP := $(BIN)/python -m pip --disable-pip-version-check
 TORCH_INDEX ?= https://download.pytorch.org/whl/cpu
 TORCH = $(shell sed -n 's/^torch==//p' constraints.txt)
 
-.PHONY: run test test-slow golden golden-write settings fuzz hostile mutants kills bench policies docs tutorials dist beside conf lock clean
+.PHONY: run test test-slow golden golden-write settings fuzz hostile mutants kills bench policies results tables docs tutorials dist beside conf lock clean
 
 run: $(VENV)/.ready
 	$(BIN)/python -m cfx $(ARGS)
@@ -71,6 +73,14 @@ DATA ?= ../shared/data
 
 policies: $(VENV)/.ready-test
 	$(BIN)/python -m cfx policies make --data $(DATA)
+	$(BIN)/python docs/tables.py
+
+results: $(VENV)/.ready-test
+	OMP_NUM_THREADS=1 $(BIN)/python docs/measure.py --data $(DATA) $(KEYS)
+	$(BIN)/python docs/tables.py
+
+tables: $(VENV)/.ready
+	$(BIN)/python docs/tables.py
 
 # Pages lie beside the site's as Markdown too: llms.txt names them.
 # Zensical's --strict stops on links without a target; docstrings that do not fit their signatures are only printed, so they are looked for.

@@ -30,7 +30,7 @@ def complete(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
         pytest.param("cfx data fetch --f", {"--folder", "--force"}, marks=needs("cfx-recordings")),
         ("cfx plugins show mod", {"model"}),
         ("cfx plugins show model hel", {"helly"}),
-        ("cfx policies show i80-w", {"i80-w99"}),
+        ("cfx policies show w9", {"w99"}),
         ("cfx plugins n", {"new"}),
         ("cfx plugins new --fo", {"--folder"}),
         pytest.param("cfx policies m", {"make"}, marks=needs("cfx-report")),

@@ -67,7 +67,7 @@ def refused_job() -> None:
 
 
 def loaded_job() -> None:
-    cfx.load("cfx://i80-idm")
+    cfx.load("cfx://idm")
 
 
 def nothing_loaded() -> None:

@@ -178,7 +178,8 @@ def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings:
             `cfx://NAME`. Of a fit its pooled parameters drive, the same for every driver.
         pairs: as `cfx.read` takes them; pairs that the policy learned from are refused.
         seed: of calibration and of intervals.
-        settings: others of the command line: `protocol="forecast"`, `optimizer="random"`.
+        settings: others of the command line: `protocol="forecast"`, `optimizer="random"`;
+            `objective` is that of the fit or the job, if it is left out.
 
     Returns:
         `pairs` has a row per pair and method; `improvement()` and `plot()` summarise them.
@@ -190,13 +191,30 @@ def evaluate(policy: PolicyLike, pairs: PairsLike, *, seed: int = 0, **settings:
     Examples:
         >>> import cfx
         >>> pairs = cfx.read(dataset="synthetic", pairs=2, frames=300)
-        >>> result = cfx.evaluate("cfx://i80-idm", pairs, optimizer="random")
+        >>> result = cfx.evaluate("cfx://idm", pairs, optimizer="random")
         >>> result.pairs.shape[0]
         8
     """
+    objective = {} if "objective" in settings else _objective_of(policy)
     with in_folder(policy) as folder:
         chosen = {"protocol": "transfer", "seed": seed, **settings_of(settings, folder)}
-        return config(pairs_from(pairs, settings), **without_data(chosen)).run()
+        return config(pairs_from(pairs, settings), **objective, **without_data(chosen)).run()
+
+
+def _objective_of(policy: PolicyLike) -> dict[str, Any]:
+    """Returns the settings of the objective of a fit, a result or a job; {} if it is not known."""
+    if isinstance(policy, str | Path):
+        file = folder_of(policy) / "config.yaml"
+        node = read_config(file).objective if file.is_file() else {}
+    elif isinstance(policy, Result):
+        node = policy.config.get("objective", {})
+    else:
+        of_fit: Experiment | None = getattr(policy, "experiment", None)
+        node = {} if of_fit is None else of_fit.config.objective
+    found: dict[str, Any] = {}
+    for key, value in node.items():
+        found["objective" if key == "name" else f"objective.{key}"] = value
+    return found
 
 
 NOTHING_KEPT = {

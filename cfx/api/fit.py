@@ -29,7 +29,7 @@ from cfx.core.files import atomic_write
 from cfx.core.guest import visit
 from cfx.data.tidy import write_tidy
 from cfx.errors import ConfigError, DataError
-from cfx.evaluation.headline import FEW_DRIVERS
+from cfx.evaluation.headline import ERRORS, FEW_DRIVERS
 from cfx.results.comparison import Comparison
 from cfx.results.result import Result
 
@@ -49,8 +49,6 @@ METHODS = ("default", "pooled", "driver_specific")
 
 _RECORDING, _PARAMETERS = "recording.parquet", "parameters.parquet"
 """Files of a saved fit besides those of a job."""
-
-_TITLES = {"rmse_speed": "RMSE of speed, m/s", "rmse_gap": "RMSE of gap, m"}
 
 _AT_BOUND = 0.01
 """So near to a bound, as a share of the distance between both, a value is at it."""
@@ -368,7 +366,8 @@ class Fit:
             if name in self.losses:
                 means = self.losses.groupby("method")[name].mean()
                 said = [f"{short_label(method)} {means[method]:.3f}" for method in METHODS]
-                lines.append(f"{_TITLES[metric]}: {', '.join(said)}")
+                heading, unit = ERRORS[metric]
+                lines.append(f"{heading}, {unit}: {', '.join(said)}")
         few = self.losses["driver"].nunique()
         about = plural(len(self.parameters), "pair")
         if few < FEW_DRIVERS:

@@ -111,7 +111,7 @@ def forecast(
     Examples:
         >>> import cfx
         >>> pairs = cfx.read(dataset="synthetic", pairs=2, frames=300)
-        >>> policy = "cfx://i80-idm-stochastic"
+        >>> policy = "cfx://idm-stochastic"
         >>> future = cfx.forecast(policy, pairs, at=10.0, horizon=2.0, samples=3)
         >>> future
         Forecast(2 pairs, 3 paths each)

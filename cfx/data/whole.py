@@ -1,8 +1,8 @@
-"""Is everybody recorded? Asked where a file names no leaders, and the next in the lane stands in.
+"""Looks for signs that a recording lacks vehicles.
 
-If a vehicle is missing, whoever drives behind it is taken to follow the one ahead of it: the gap is
-too long, and the driver reacts to nobody whom the recording shows. Nothing of this contradicts
-anything, so what is found here is a doubt.
+Where a file names no leaders, the next vehicle in the lane counts as the leader. If a vehicle in
+between was not recorded, the gap is too long, and the follower reacts to a vehicle that is not in
+the data. The data do not contradict this, so what is found here is a warning, not an error.
 """
 
 from __future__ import annotations
@@ -19,26 +19,26 @@ _SHARE = 0.1
 """Share of the vehicles that appear or vanish in mid-road; where all are recorded it is 0."""
 
 _FAR_S, _FAR_M = 3.0, 10.0
-"""Nobody is held up by a leader who is farther ahead than this time gap and distance, and who is
-not slower."""
+"""A leader who is farther ahead than this time gap and distance, and not slower, does not hold up a
+follower."""
 
 _SLOW = 0.8
-"""Who drives below this share of their own speed in that lane would go faster if they could."""
+"""A driver below this share of their desired speed would go faster if they could."""
 
-_OWN = 0.9
-"""Quantile of a vehicle's speeds in a lane that counts as its own speed there."""
+_DESIRED = 0.9
+"""Quantile of a vehicle's speeds in a lane that counts as its desired speed there."""
 
 _ACCELERATES_MPS2 = 0.1
 
 _HELD_UP = 0.25
-"""Share of the moments in which such drivers do not accelerate: 0 to 0.13 in simulations of two
-lanes with lorries, of a town with lights, and of stops in mid-road; 0.3 to 0.9 where 40 % of their
-vehicles are recorded."""
+"""Share of the moments at which slow drivers far behind a leader do not accelerate. It is 0 to 0.13
+in simulations of two lanes with lorries, of a town with lights, and of stops in mid-road, and 0.3
+to 0.9 where only 40 % of their vehicles are recorded."""
 
 _LEAST_S, _LEAST_VEHICLES = 5.0, 3
-"""Time and vehicles that say something."""
+"""With less time or fewer vehicles nothing is said."""
 
-_HOW = (
+_QUESTION = (
     "are all vehicles recorded? Where the file names no leaders, the next recorded vehicle in the"
     " lane counts as one"
 )
@@ -52,7 +52,7 @@ def remarks_on_leaders(tracks: Tracks) -> tuple[Remark, ...]:
     """
     if not len(tracks):
         return ()
-    return tuple(Remark(f"{words}: {_HOW}") for words in _signs(tracks))
+    return tuple(Remark(f"{words}: {_QUESTION}") for words in _signs(tracks))
 
 
 def _signs(tracks: Tracks) -> Iterator[str]:
@@ -65,19 +65,19 @@ def _signs(tracks: Tracks) -> Iterator[str]:
     # Vehicles come in where a lane begins, behind all others, and leave it in front of all others.
     comes = starts[tracks.frame[starts] > tracks.frame.min()]
     leaves = last[tracks.frame[last] < tracks.frame.max()]
-    for rows, is_between, does in (
+    for rows, has_neighbour, event in (
         (comes, has_follower, "appear in mid-road, ahead of another one"),
         (leaves, has_leader, "vanish in mid-road, behind another one"),
     ):
-        count = int(np.count_nonzero(is_between[rows]))
+        count = int(np.count_nonzero(has_neighbour[rows]))
         if count >= _LEAST_VEHICLES and count >= _SHARE * len(rows):
-            yield f"{count} of {len(rows)} vehicles {does}"
-    is_free, goes = _free_moments(tracks, ahead, has_leader)
+            yield f"{count} of {len(rows)} vehicles {event}"
+    is_free, acceleration = _free_moments(tracks, ahead, has_leader)
     drivers = len(np.unique(tracks.vehicle[is_free]))
     seconds = float(np.count_nonzero(is_free)) * tracks.dt
     if seconds < _LEAST_S or drivers < _LEAST_VEHICLES:
         return
-    held_up = float(np.mean(goes[is_free] < _ACCELERATES_MPS2))
+    held_up = float(np.mean(acceleration[is_free] < _ACCELERATES_MPS2))
     if held_up >= _HELD_UP:
         yield (
             f"{drivers} vehicles drive slowly far behind a leader who is not slower, and in"
@@ -86,14 +86,15 @@ def _signs(tracks: Tracks) -> Iterator[str]:
 
 
 def _free_moments(tracks: Tracks, ahead: Ints, has_leader: Marks) -> tuple[Marks, Floats]:
-    """Returns the rows at which a driver could go faster, and the acceleration there, `(N,)` each.
+    """Returns the rows at which a driver could go faster, and their accelerations, `(N,)` each.
 
-    The acceleration is that over the next second, in the same lane behind the same leader, m/s2.
+    The acceleration is the mean one of the next second, in the same lane behind the same leader,
+    m/s2.
     """
     speed = tracks.speed
     gap = tracks.position[ahead] - tracks.length[ahead] - tracks.position
     is_free = has_leader & (gap > _FAR_S * speed + _FAR_M) & (speed[ahead] >= speed - 0.5)
-    is_free &= speed < _SLOW * _own_speeds(tracks)
+    is_free &= speed < _SLOW * _desired_speeds(tracks)
     frames = max(1, round(1.0 / tracks.dt))
     later = np.minimum(np.arange(len(tracks)) + frames, len(tracks) - 1)
     is_free &= tracks.frame[later] - tracks.frame == frames
@@ -102,11 +103,11 @@ def _free_moments(tracks: Tracks, ahead: Ints, has_leader: Marks) -> tuple[Marks
     return is_free, (speed[later] - speed) / (frames * tracks.dt)
 
 
-def _own_speeds(tracks: Tracks) -> Floats:
-    """Returns the speed that each row's vehicle has in that lane if nobody is in the way, m/s."""
+def _desired_speeds(tracks: Tracks) -> Floats:
+    """Returns the desired speed of each row's vehicle in that lane, m/s."""
     stint = np.cumsum(changes(tracks.recording, tracks.vehicle, tracks.lane)) - 1
     order = np.lexsort((tracks.speed, stint))
     starts, sizes = runs(stint)
-    at = starts + (_OWN * (sizes - 1)).astype(np.int64)
+    at = starts + (_DESIRED * (sizes - 1)).astype(np.int64)
     speeds: Floats = tracks.speed[order][at][stint]
     return speeds

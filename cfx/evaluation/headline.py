@@ -29,7 +29,7 @@ TESTED = "tested on"
 PERCENT = "improvement_percent"
 """What charts begin with. No metric of the headline has a group: MLflow puts such first."""
 
-_ERRORS = {"rmse_speed": ("RMSE of speed", "m/s"), "rmse_gap": ("RMSE of gap", "m")}
+ERRORS = {"rmse_speed": ("RMSE of speed", "m/s"), "rmse_gap": ("RMSE of gap", "m")}
 """Heading and unit of the errors that a job tells beside the one that it is judged by."""
 
 _COUNTED = ("collisions", "hard_braking")
@@ -161,7 +161,7 @@ def headline(
     words = ["calibration"] if is_calibration else []
     if compared is not None:
         words.append(_improvement(metrics, compared, values))
-    errors = {judge.name: (judge.heading, judge.unit), **_ERRORS}
+    errors = {judge.name: (judge.heading, judge.unit), **ERRORS}
     baseline = "" if compared is None else compared.baseline
     for name, (heading, unit) in errors.items():
         measured = {}
@@ -213,7 +213,7 @@ def fitted_errors(errors: Mapping[str, float]) -> dict[str, float]:
         errors: means of driver-specific parameters there, by metric.
     """
     fitted = {}
-    for metric, (_, unit) in _ERRORS.items():
+    for metric, (_, unit) in ERRORS.items():
         if math.isfinite(errors.get(metric, math.nan)):
             fitted[with_unit(f"{metric}_fitted", unit)] = round(errors[metric], 3)
     return fitted

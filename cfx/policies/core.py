@@ -1,4 +1,4 @@
-"""Networks on a grid of places: what training, evaluation and live drivers share.
+"""The tensor functions of a policy that training, evaluation and live drivers share.
 
 Shapes: N networks, D drivers of each (or in any order), P pairs, a driver each, B drivers of the
 network that has most, L frames of a token, f features of a token, c features of conditioning, n

@@ -51,12 +51,12 @@ for name in ("optimal_velocity", "idm"):
 #
 # ## Where will they be?
 #
-# `cfx://i80-idm-stochastic` learned to drive as people on a congested motorway do, and to vary as
+# `cfx://idm-stochastic` learned to drive as people on a congested motorway do, and to vary as
 # they do. From 20 s on, knowing what was measured before, 50 paths of 10 s each:
 
 # %%
 future = cfx.forecast(
-    "cfx://i80-idm-stochastic", pairs, at=20.0, horizon=10.0 if not SMOKE else 2.0, samples=50
+    "cfx://idm-stochastic", pairs, at=20.0, horizon=10.0 if not SMOKE else 2.0, samples=50
 )
 bands = future.quantiles((0.05, 0.5, 0.95))
 last = bands.index.get_level_values("time_s").max()
@@ -66,7 +66,7 @@ print(bands.xs(last, level="time_s").round(1).head(6))
 # ![Fans of forecasts and what the drivers did](own_model.png)
 #
 # How often does such a band hold what happened? One moment of a few drivers says little;
-# `cfx.evaluate("cfx://i80-idm-stochastic", pairs, protocol="forecast", **{"protocol.samples": 50})`
+# `cfx.evaluate("cfx://idm-stochastic", pairs, protocol="forecast", **{"protocol.samples": 50})`
 # scores every moment of all ([forecasts](../forecasts.md)).
 
 # %%

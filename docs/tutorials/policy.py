@@ -52,8 +52,8 @@ print(f"improvement {metrics[f'{key}/geometric']:+.1%} (95 % interval {low:+.1%}
 
 # %% [markdown]
 # Does the interval exclude zero? Run it again with `seed=1`: other folds, other networks. With
-# real drivers expect less than with these: [on I-80](../results.md#unseen-drivers) the policy for
-# IDM improves by 5.6 % over pooled parameters, that for Krauss by 14.6 %.
+# real drivers expect less than with these: [on I-80](../results.md#unseen-drivers) a policy for IDM
+# is hardly closer to the drivers than pooled parameters, one for Krauss's model clearly.
 #
 # ## For whom?
 #

@@ -23,7 +23,7 @@ END_S = 20 if SMOKE else 900
 #
 # Any `.sumocfg` will do. Here a ring road with 22 vehicles of the vType `car` is written into a
 # folder; yours is already there. From the shell, `python -m cfx drive scenario/ring.sumocfg
-# --drivers car=cfx://i80-idm` drives all of them by a [ready-made policy](../policies.md) and
+# --drivers car=cfx://idm` drives all of them by a [ready-made policy](../policies.md) and
 # prints how they drove.
 
 # %%
@@ -39,7 +39,7 @@ print(scenario)
 # obeyed, and SUMO's safe gap is kept; `speed_mode=0` drives what the model says and obeys none.
 
 # %%
-driver = cfx_sumo.Driver.load("cfx://i80-idm")
+driver = cfx_sumo.Driver.load("cfx://idm")
 libsumo.start(["sumo", "-c", str(scenario), "--no-step-log", "true", "--no-warnings", "true"])
 speeds = []
 while libsumo.simulation.getTime() < END_S:

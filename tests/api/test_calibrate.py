@@ -149,8 +149,8 @@ def test_settings_of_data_choose_what_is_read_or_are_refused(
         lambda: cfx.calibrate(pairs, "krauss", **fewer),
         lambda: cfx.config(pairs, **fewer),
         lambda: cfx.train(pairs, "krauss", **fewer),
-        lambda: cfx.evaluate("cfx://i80-idm", pairs, **fewer),
-        lambda: cfx.forecast("cfx://i80-idm", pairs, at=1.0, **fewer),
+        lambda: cfx.evaluate("cfx://idm", pairs, **fewer),
+        lambda: cfx.forecast("cfx://idm", pairs, at=1.0, **fewer),
         lambda: cfx.simulate("krauss", None, pairs, **fewer),
     )
     for call in calls:
@@ -166,8 +166,8 @@ def test_settings_that_do_nothing_in_python_are_refused(pairs: cfx.Pairs, settin
     calls = (
         lambda: cfx.calibrate(pairs, "krauss", **given),
         lambda: cfx.train(pairs, "krauss", **given),
-        lambda: cfx.evaluate("cfx://i80-idm", pairs, **given),
-        lambda: cfx.forecast("cfx://i80-idm", pairs, at=1.0, **given),
+        lambda: cfx.evaluate("cfx://idm", pairs, **given),
+        lambda: cfx.forecast("cfx://idm", pairs, at=1.0, **given),
         lambda: cfx.simulate("krauss", None, pairs, **given),
     )
     for call in calls:
@@ -417,7 +417,7 @@ def test_what_is_no_recording_is_said(given: Any) -> None:
     with pytest.raises(ConfigError, match=r"give a (path|file)"):
         cfx.calibrate(given, "idm")
     with pytest.raises(ConfigError, match=r"give a (path|file)"):
-        cfx.evaluate("cfx://i80-idm", given)
+        cfx.evaluate("cfx://idm", given)
 
 
 def test_a_fit_says_whether_it_is_the_optimum(
@@ -458,6 +458,7 @@ def test_what_was_minimised_comes_first(fit: cfx.Fit) -> None:
 def test_a_fit_drives_other_drivers_with_its_pooled_parameters(fit: cfx.Fit) -> None:
     others = cfx.read(dataset="synthetic", pairs=2, frames=300, seed=5)
     tested = cfx.evaluate(fit, others, optimizer="random", **{"optimizer.samples": 64})
+    assert tested.judge.name == "rmse_gap"  # what the fit minimised
     rows = tested.pairs[tested.pairs["method"] == "pooled"]
     chosen = rows.filter(like="parameter_").rename(columns=lambda one: one[len("parameter_") :])
     for values in chosen[fit.pooled.index].to_numpy():

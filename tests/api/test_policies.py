@@ -124,7 +124,7 @@ def test_a_forecast_reads_nothing_after_its_moment(others: cfx.Pairs) -> None:
     found = []
     for table in (frame, changed):
         read = cfx.read(table, **settings)
-        found.append(cfx.forecast("cfx://i80-idm", read, at=10.0, horizon=3.0))
+        found.append(cfx.forecast("cfx://idm", read, at=10.0, horizon=3.0))
     pd.testing.assert_frame_equal(found[0].paths, found[1].paths)
     first = found[0].paths.groupby("pair_id").first()
     assert (first["time_s"] == 10.0).all()
@@ -134,7 +134,7 @@ def test_a_forecast_reads_nothing_after_its_moment(others: cfx.Pairs) -> None:
 
 @needs("cfx-forecasts")
 def test_a_forecast_is_that_of_the_protocol_to_the_last_bit(others: cfx.Pairs) -> None:
-    policy = "cfx://i80-idm"
+    policy = "cfx://idm"
     settings = {"protocol.horizons": [2.0], "protocol.stride": 60.0}  # one moment
     result = cfx.evaluate(policy, others, protocol="forecast", **RANDOM, **settings)
     assert result.evaluation is not None
@@ -148,10 +148,10 @@ def test_a_forecast_is_that_of_the_protocol_to_the_last_bit(others: cfx.Pairs) -
 
 
 def test_a_forecast_ends_where_what_is_given_ends(others: cfx.Pairs) -> None:
-    given = cfx.forecast("cfx://i80-idm", others, at=28.0, horizon=5.0)
+    given = cfx.forecast("cfx://idm", others, at=28.0, horizon=5.0)
     assert given.paths["time_s"].max() == pytest.approx(29.9)
     settings: dict[str, Any] = {"leader": "constant_speed", "at": 28.0, "horizon": 5.0}
-    free = cfx.forecast("cfx://i80-idm", others, **settings)
+    free = cfx.forecast("cfx://idm", others, **settings)
     assert free.paths["time_s"].max() == pytest.approx(33.0)
     assert free.measured["time_s"].max() == pytest.approx(29.9)
 
@@ -159,8 +159,7 @@ def test_a_forecast_ends_where_what_is_given_ends(others: cfx.Pairs) -> None:
 def test_sampled_paths_differ_by_seed_and_make_fans(others: cfx.Pairs) -> None:
     settings: dict[str, Any] = {"at": 10.0, "horizon": 2.0, "samples": 4}
     one, same, other = (
-        cfx.forecast("cfx://i80-idm-stochastic", others, seed=seed, **settings)
-        for seed in (0, 0, 1)
+        cfx.forecast("cfx://idm-stochastic", others, seed=seed, **settings) for seed in (0, 0, 1)
     )
     pd.testing.assert_frame_equal(one.paths, same.paths)
     assert not one.paths.equals(other.paths)
@@ -173,13 +172,13 @@ def test_sampled_paths_differ_by_seed_and_make_fans(others: cfx.Pairs) -> None:
 
 def test_a_forecast_refuses_what_it_cannot_do(others: cfx.Pairs) -> None:
     with pytest.raises(ConfigError, match="leaves nothing to chance"):
-        cfx.forecast("cfx://i80-idm", others, at=10.0, samples=5)
+        cfx.forecast("cfx://idm", others, at=10.0, samples=5)
     with pytest.raises(ConfigError, match=r"pair .* lasts 29.9 s"):
-        cfx.forecast("cfx://i80-idm", others, at=40.0)
+        cfx.forecast("cfx://idm", others, at=40.0)
     with pytest.raises(ConfigError, match="at=nan: give a moment"):
-        cfx.forecast("cfx://i80-idm", others, at=float("nan"))
+        cfx.forecast("cfx://idm", others, at=float("nan"))
     for key in ("model", "policy.hidden_size", "windows"):
         with pytest.raises(ConfigError, match=f"{key}: the policy brings its model"):
-            cfx.evaluate("cfx://i80-idm", others, **{key: "krauss"})
-    with pytest.raises(DataError, match="i80-idn"):
-        cfx.forecast("cfx://i80-idn", others, at=10.0)
+            cfx.evaluate("cfx://idm", others, **{key: "krauss"})
+    with pytest.raises(DataError, match="idn"):
+        cfx.forecast("cfx://idn", others, at=10.0)

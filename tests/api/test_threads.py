@@ -24,7 +24,7 @@ import cfx
 from cfx.app import hydra_source
 
 SMALL = {"optimizer": "random", "optimizer.samples": 16}
-POLICY = "cfx://i80-idm"
+POLICY = "cfx://idm"
 
 
 @pytest.fixture(scope="module")

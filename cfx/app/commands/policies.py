@@ -26,7 +26,7 @@ class PoliciesCommand(Command):
         actions = made.add_subparsers(dest="action")
         actions.add_parser("list", help="all of them, as without an action")
         show = actions.add_parser("show", help="the card of a policy: what it knows, and how well")
-        name = show.add_argument("name", help="such as i80-idm, or cfx://i80-idm")
+        name = show.add_argument("name", help="such as idm, or cfx://idm")
         complete_with(name, lambda _: ready.names())
         return made
 

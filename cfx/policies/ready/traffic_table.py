@@ -8,12 +8,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from cfx.policies.ready import SCHEME, card_of, folder_of_ready_made, is_ready_made
+from cfx.policies.ready import SCHEME, folder_of_ready_made
 
 __all__ = [
     "FILE",
-    "NOT_FOR_TRAFFIC",
-    "is_for_traffic",
     "outside_words",
     "traffic_lines",
     "traffic_of",
@@ -21,9 +19,6 @@ __all__ = [
 """What plugins may use, as `cfx.plugin.traffic_table`."""
 
 FILE = "traffic.json"
-
-NOT_FOR_TRAFFIC = "reproduces one recording; not for traffic"
-"""What is said of policies that fill a road wrongly, since all they know is one congested road."""
 
 
 def traffic_of(name: str) -> dict[str, Any] | None:
@@ -37,13 +32,6 @@ def traffic_of(name: str) -> dict[str, Any] | None:
         return None
     measured: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
     return measured
-
-
-def is_for_traffic(source: str) -> bool:
-    """Says whether a run may fill roads: all but ready-made policies whose cards say otherwise."""
-    if not is_ready_made(source):
-        return True
-    return bool(card_of(source.removeprefix(SCHEME)).get("for_traffic", True))
 
 
 def traffic_lines(measured: dict[str, Any]) -> list[str]:

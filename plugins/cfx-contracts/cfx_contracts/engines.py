@@ -1,6 +1,6 @@
 """The contract of an engine, statement by statement.
 
-The work is made up: small sums, which any worker can do that can import this module.
+The work is trivial: squares of small numbers. A worker has to import this module to do it.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ SHARDS = 5
 
 
 def _squares(shard: list[int], report: Report) -> list[int]:
-    """Squares each number, and says so each time."""
-    found = []
+    """Squares each number, and reports each."""
+    squares = []
     for number in shard:
-        found.append(number * number)
+        squares.append(number * number)
         report(1)
-    return found
+    return squares
 
 
 def _fails_at_three(shard: list[int], report: Report) -> int:

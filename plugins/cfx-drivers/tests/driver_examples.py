@@ -23,7 +23,7 @@ import cfx_drivers.gym
 import cfx_drivers.onnx
 from cfx.app import cli
 
-DRIVER, LENGTH, DT = "cfx://i80-idm", 5.0, 0.1
+DRIVER, LENGTH, DT = "cfx://idm", 5.0, 0.1
 
 
 def platoon(example: str) -> pd.DataFrame:

@@ -31,7 +31,7 @@ def platoon(followers: int) -> Road:
 
 def test_a_platoon_drives_as_cfx_does() -> None:
     road = platoon(2)
-    step = driver_step("cfx://i80-idm")
+    step = driver_step("cfx://idm")
     state = step.begin(2)
     position = torch.tensor([475.0, 450.0]).double()
     speed, acceleration = torch.full((2,), 12.0).double(), torch.zeros(2).double()

@@ -67,7 +67,7 @@ def test_a_stochastic_driver_drives_the_example_as_cfx_does(
 ) -> None:
     """It has all parts that a driver may have: an ensemble, a residual, noise, memory."""
     path = tmp_path / "driver.onnx"
-    assert main(["export", "cfx://i80-idm-stochastic", "--to", "onnx", "--output", str(path)]) == 0
+    assert main(["export", "cfx://idm-stochastic", "--to", "onnx", "--output", str(path)]) == 0
     assert "steps of 0.1 s" in capsys.readouterr().out
     assert path.stat().st_size < 1e6
     done = subprocess.run(
@@ -75,7 +75,7 @@ def test_a_stochastic_driver_drives_the_example_as_cfx_does(
     )
     assert done.returncode == 0, done.stderr
     found = np.array([line.split(",") for line in done.stdout.split()[1:]], dtype=float)[:, 1:]
-    step = DriverStep(load_agent(folder_of("cfx://i80-idm-stochastic") / "policy"))
+    step = DriverStep(load_agent(folder_of("cfx://idm-stochastic") / "policy"))
     expected = driven(step)
     # Rounding in single precision, in which networks are, multiplies from vehicle to vehicle.
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-4)
@@ -85,7 +85,7 @@ def test_a_stochastic_driver_drives_the_example_as_cfx_does(
     assert graph.opset_import[0].version == 20
     about = {one.key: one.value for one in graph.metadata_props}
     assert about["cfx.dt"] == "0.1 s"
-    assert about["cfx.policy"] == "cfx://i80-idm-stochastic"
+    assert about["cfx.policy"] == "cfx://idm-stochastic"
     assert about["cfx.parameters"].startswith("v0 [m/s], T [s], s0 [m]")
     card = path.with_suffix(".md").read_text(encoding="utf-8")
     for tensor in (*graph.graph.input, *graph.graph.output):
@@ -108,7 +108,7 @@ def test_the_example_in_cpp_drives_as_the_one_in_python(tmp_path: Path) -> None:
     built += [f"-I{openvino / 'include'}", library, f"-Wl,-rpath,{library.parent}"]
     subprocess.run(built, check=True)
     path = tmp_path / "driver.onnx"
-    assert main(["export", "cfx://i80-idm", "--to", "onnx", "--output", str(path)]) == 0
+    assert main(["export", "cfx://idm", "--to", "onnx", "--output", str(path)]) == 0
     commands: list[list[str | Path]] = [[program, path], [sys.executable, PLATOON, path]]
     ran = [subprocess.run(one, capture_output=True, text=True, check=True) for one in commands]
     rows = [[line.split(",") for line in done.stdout.split()[-900:]] for done in ran]
@@ -192,5 +192,5 @@ def test_a_policy_that_is_no_graph_is_refused() -> None:
 def test_an_unknown_format_is_answered_with_the_nearest(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    assert main(["export", "cfx://i80-idm", "--to", "onxx"]) == 2
+    assert main(["export", "cfx://idm", "--to", "onxx"]) == 2
     assert "there is no export 'onxx'. Did you mean 'onnx'?" in capsys.readouterr().err

@@ -99,6 +99,6 @@ def test_who_was_learned_from_is_refused_and_who_is_too_short_is_left_out(
 
 
 def test_a_ready_made_policy_forecasts(tmp_path: Path) -> None:
-    result = cfx.run([*FORECAST, "protocol.run=cfx://i80-idm", f"hydra.run.dir={tmp_path / 'job'}"])
+    result = cfx.run([*FORECAST, "protocol.run=cfx://idm", f"hydra.run.dir={tmp_path / 'job'}"])
     assert result.metrics["forecast/rmse_speed_2s/policy"] > 0
     assert (result.folder / "config.yaml").is_file()

@@ -62,5 +62,5 @@ def test_chains_are_a_dimension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
 
 def test_a_job_without_a_posterior_has_none_to_write(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"cfx://i80-idm: this job has found no posterior"):
-        NetcdfExport().write("cfx://i80-idm", tmp_path / "x.nc")
+    with pytest.raises(DataError, match=r"cfx://idm: this job has found no posterior"):
+        NetcdfExport().write("cfx://idm", tmp_path / "x.nc")

@@ -144,7 +144,7 @@ def test_what_cannot_be_grouped_is_one_sentence(
         ("data.path=../shared/data/pairs.parquet", "data.path=../shared/data/pairs.parquet"),
         ("sqlite:////home/ann/mlflow.db", "sqlite:///mlflow.db"),
         ("https://example.org/some/page", "https://example.org/some/page"),
-        ("cfx://i80-idm, m/s, 1/2", "cfx://i80-idm, m/s, 1/2"),
+        ("cfx://idm, m/s, 1/2", "cfx://idm, m/s, 1/2"),
     ],
 )
 def test_folders_of_absolute_paths_are_left_out(text: str, kept: str) -> None:

@@ -314,7 +314,7 @@ town = SCENARIOS["town"].network
 Path("cross.sumocfg").write_text(f'''<configuration><input><net-file value="{town}"/>
   <route-files value="cross.rou.xml"/></input><processing><collision.action value="warn"/>
   </processing></configuration>''')
-run = run_scenario(Path("cross.sumocfg"), {"car": "cfx://i80-idm"}, end=60, step=0.5, speed_mode=0)
+run = run_scenario(Path("cross.sumocfg"), {"car": "cfx://idm"}, end=60, step=0.5, speed_mode=0)
 print(json.dumps([run.tallies["car"].crossings, run.crossings_of_sumo]))
 """
 
@@ -341,9 +341,9 @@ Path("late.rou.xml").write_text('''<routes><vType id="car"/> <vType id="bus"/>
 Path("late.sumocfg").write_text('''<configuration><input><net-file value="{SHIPPED}"/>
   <route-files value="late.rou.xml"/></input><processing><ignore-route-errors value="true"/>
   </processing></configuration>''')
-run = run_scenario(Path("late.sumocfg"), {{"car": "cfx://i80-idm"}}, end=2.0)
+run = run_scenario(Path("late.sumocfg"), {{"car": "cfx://idm"}}, end=2.0)
 try:
-    run_scenario(Path("late.sumocfg"), {{"bus": "cfx://i80-idm"}}, end=2.0,
+    run_scenario(Path("late.sumocfg"), {{"bus": "cfx://idm"}}, end=2.0,
                  sumo_options=["--error-log", "own.txt"])
 except SumoError as error:
     print(json.dumps([run.left_out, str(error), Path("own.txt").is_file()]))

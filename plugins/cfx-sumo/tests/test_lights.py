@@ -32,7 +32,7 @@ sys.modules["pyarrow"] = None
 import libsumo
 from cfx_sumo.live.driver import Driver
 libsumo.start(["sumo", "-c", "town.sumocfg", "--no-step-log", "--no-warnings"])
-driver = Driver.load("cfx://i80-idm")
+driver = Driver.load("cfx://idm")
 while libsumo.simulation.getTime() < END:
     libsumo.simulationStep()
     names = libsumo.vehicle.getIDList()
@@ -89,7 +89,7 @@ def test_by_default_nobody_runs_a_red_light_passes_a_stop_or_collides(
     """`cfx drive` drives by `Fleet.load`."""
     (tmp_path / "town.sumocfg").write_text(CONFIGURATION)
     if way == "cfx drive":
-        command = ["-m", "cfx", "drive", "town.sumocfg", "--drivers", "car=cfx://i80-idm"]
+        command = ["-m", "cfx", "drive", "town.sumocfg", "--drivers", "car=cfx://idm"]
         said = python(live, tmp_path, *command)
         row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
         assert row[5:9] == ["0"] * 4, "contact, below minGap, crossing paths, teleports"
@@ -135,7 +135,7 @@ Path("close.rou.xml").write_text('''<routes><vType id="car" sigma="0" speedDev="
 command = ["sumo", "-n", str(SHIPPED), "-r", "close.rou.xml", "--step-length", "0.1",
            "--no-step-log", "--no-warnings", "--collision.action", ACTION]
 with started(Path("close"), command, False) as sumo:
-    fleet = Fleet({"car": Driver.load("cfx://i80-idm")})
+    fleet = Fleet({"car": Driver.load("cfx://idm")})
     step = fleet.step
     def careless(connection):
         step(connection)

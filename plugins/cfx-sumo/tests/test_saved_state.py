@@ -34,7 +34,7 @@ for number in range(0, 22, 3):
 routes.write_text(text)
 command = ["sumo", "-c", str(scenario), "--no-step-log", "--no-warnings",
            "--save-state.precision", "17"]
-runs = {"car": "cfx://i80-idm-stochastic", "other": "cfx://i80-w99"}
+runs = {"car": "cfx://idm-stochastic", "other": "cfx://w99"}
 
 def speeds(fleet, until):
     found = []

@@ -39,7 +39,7 @@ def test_drive_needs_no_arguments(tmp_path: Path) -> None:
 
 
 def test_the_motorway_has_waves_and_lane_changes(tmp_path: Path, live: Forks) -> None:
-    said = drive(live, tmp_path, "motorway", "--drivers", "car=cfx://i80-krauss", "--end", "60")
+    said = drive(live, tmp_path, "motorway", "--drivers", "car=cfx://krauss", "--end", "60")
     row = next(line.split() for line in said.splitlines() if line.strip().startswith("car"))
     assert int(row[1]) > 50
     assert int(row[4]) > 10  # lane changes
@@ -90,11 +90,11 @@ def town(live: Forks, folder: Path, policy: str, end: int, step: float) -> None:
 
 def test_the_town_has_no_collisions(tmp_path: Path, live: Forks) -> None:
     """At lights, where left turns give way, and at the roundabout; with SUMO's checks."""
-    town(live, tmp_path, "cfx://i80-w99", 100, 0.5)
+    town(live, tmp_path, "cfx://w99", 100, 0.5)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("policy", ["cfx://i80-w99", "cfx://idm"])
+@pytest.mark.parametrize("policy", ["cfx://w99", "cfx://idm"])
 @pytest.mark.parametrize("step", [0.05, 0.1, 0.5, 1.0])
 def test_the_town_has_no_collisions_at_any_step(
     policy: str, step: float, tmp_path: Path, live: Forks
@@ -113,7 +113,7 @@ import sys
 sys.modules["pyarrow"] = None
 import json
 from cfx_sumo.drive.stress import run_stress
-result = run_stress({{"car": "cfx://i80-idm"}}, seed=3, cut_ins=30, step={step})
+result = run_stress({{"car": "cfx://idm"}}, seed=3, cut_ins=30, step={step})
 print(json.dumps(result.to_json()))
 """
     done = live.run(["-c", script], tmp_path)

@@ -66,7 +66,7 @@ def test_without_sumo_what_needs_it_is_left_out_and_said(monkeypatch: pytest.Mon
 
     monkeypatch.setattr(stress_traffic, "require_sumo", missing)
     monkeypatch.setattr(traffic, "driver_traffic", lambda *_, **__: ALONE)
-    found = measure_traffic("cfx://i80-idm")
+    found = measure_traffic("cfx://idm")
     assert found.measures == ALONE.measures
     assert found.missing.startswith("A light, a lane drop and a town were not measured: SUMO is")
 
@@ -83,7 +83,7 @@ def test_mistakes_are_one_sentence() -> None:
 WITH_SUMO = """
 import json
 from cfx_sumo.drive import traffic
-found = traffic._with_sumo("cfx://i80-krauss", 1.0, 0, (), lambda: None)
+found = traffic._with_sumo("cfx://krauss", 1.0, 0, (), lambda: None)
 print(json.dumps({one.name: one.value for one in found}))
 """
 

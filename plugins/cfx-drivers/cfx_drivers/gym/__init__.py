@@ -3,7 +3,7 @@
     import gymnasium, cfx_drivers.gym
 
     gymnasium.register_envs(cfx_drivers.gym)
-    env = gymnasium.make("cfx/CarFollowing-v0", recording="pairs.parquet", driver="cfx://i80-idm")
+    env = gymnasium.make("cfx/CarFollowing-v0", recording="pairs.parquet", driver="cfx://idm")
 
 Importing it makes the environments known, as Gymnasium's convention is.
 """

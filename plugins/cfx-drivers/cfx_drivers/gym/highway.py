@@ -35,7 +35,7 @@ class CfxVehicle(IDMVehicle):  # type: ignore[misc]  # highway-env has no types
         ConfigError: the simulation's step is not the driver's.
     """
 
-    driver: ClassVar[str | Path] = "cfx://i80-idm"
+    driver: ClassVar[str | Path] = "cfx://idm"
     speed: float
 
     def __init__(self, *arguments: Any, **options: Any) -> None:

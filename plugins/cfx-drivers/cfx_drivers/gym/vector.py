@@ -128,7 +128,7 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
         if (driver is None) != (followers == 0) or followers < 0:
             raise ConfigError(
                 f"followers={followers}: vehicles behind the ego need a driver, such as"
-                " driver='cfx://i80-idm', and a driver needs a vehicle"
+                " driver='cfx://idm', and a driver needs a vehicle"
             )
         self.num_envs = num_envs
         self.render_mode = render_mode

@@ -198,7 +198,6 @@ def _card(
         "limits": _limits(agent),
         "valid_range": _range(agent),
         "base_parameters": _base(agent),
-        "for_traffic": RECIPES[name].is_for_traffic,
     }
 
 
@@ -377,7 +376,6 @@ def card_text(card: dict[str, Any], measured: dict[str, Any] | None = None) -> s
         "",
         card["summary"],
         "",
-        *_purpose_lines(card),
         f"- **Model and policy**: {card['model']}, {card['policy']}",
         f"- **Training data**: {data['source']};"
         f" {data['pairs']} pairs of {data['drivers']} drivers",
@@ -414,17 +412,6 @@ def card_text(card: dict[str, Any], measured: dict[str, Any] | None = None) -> s
 
 def _simulated_lines(simulated: str) -> list[str]:
     return [f"- **Simulated drivers** that it learned from too: {simulated}"] if simulated else []
-
-
-def _purpose_lines(card: dict[str, Any]) -> list[str]:
-    if card.get("for_traffic", True):
-        return []
-    return [
-        f"**It {traffic_table.NOT_FOR_TRAFFIC}.** The gaps that its drivers keep beyond that"
-        " recording's congestion are not people's: see Traffic. For roads full of vehicles take"
-        " `cfx://idm`.",
-        "",
-    ]
 
 
 def _expected_lines(expected: dict[str, float | None]) -> list[str]:

@@ -58,5 +58,5 @@ def test_a_finished_job_is_published_without_training(
 
 
 def test_an_unknown_recipe_is_one_sentence(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"there is no such recipe\. Did you mean 'i80-idm'"):
-        make(["i80-idn"], tmp_path / "data.parquet", tmp_path)
+    with pytest.raises(ConfigError, match=r"there is no such recipe\. Did you mean 'idm'"):
+        make(["idn"], tmp_path / "data.parquet", tmp_path)

@@ -1,4 +1,4 @@
-"""Roads for the demonstration: the longest stretch of three lanes or more in a network.
+"""Finds the road of the demonstration: the longest stretch of three lanes or more in a network.
 
 The network may come from an OpenStreetMap extract. A *track* is a lane that goes on to the end of
 the stretch, whatever its number is on each edge: where a ramp joins, lanes are numbered anew.
@@ -27,7 +27,7 @@ netconvert made it of `motorway.osm.xml` beside it.
 """
 
 ABREAST = 3
-"""Tracks that one pair takes: its leader thrice, each ahead of another follower."""
+"""Tracks that one pair takes: three, with its leader ahead of three versions of its follower."""
 
 _FLAGS = (
     "--geometry.remove",
@@ -37,7 +37,7 @@ _FLAGS = (
     "--keep-edges.by-vclass",
     "passenger",
 )
-"""As much as a motorway needs; `--ramps.guess` would number lanes anew where it guesses."""
+"""Options of netconvert. `--ramps.guess` is left out: it numbers lanes anew where it guesses."""
 
 
 @dataclass(frozen=True)

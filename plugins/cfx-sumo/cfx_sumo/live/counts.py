@@ -1,4 +1,4 @@
-"""What a live driver has done, as numbers for a report.
+"""Counts what a live driver does, for the report at the end.
 
 Shapes: D vehicles, f signals.
 """
@@ -12,21 +12,22 @@ from torch import Tensor
 from cfx.plugin import Agent, valid_range
 
 _OBEYED_MPS = 1e-3
-"""A speed this close to what SUMO was told is what it was told."""
+"""SUMO obeyed where a vehicle's speed differs by at most this from the speed that it was told."""
 
 
 @dataclass
 class DriveCounts:
-    """What a driver did over all steps of all its vehicles.
+    """Counts over all steps of all vehicles of a driver.
 
     Attributes:
         steps: steps of the model behind a leader.
-        outside: those of them that began outside what the policy has learned from.
-        limited: those at a limit of acceleration.
-        beyond: in how many each signal alone was too low, then too high; None before the first.
+        outside: of these, the ones that began outside the policy's valid range.
+        limited: of these, the ones at a limit of acceleration.
+        beyond: steps outside the valid range in which each signal was too low, then too high,
+            `(2 f,)`; None before the first step.
         free: steps of the model without a leader.
-        told: speeds that SUMO was told and whose result was seen.
-        changed: those of them that SUMO changed, by the checks that the speed mode leaves it.
+        told: speeds that SUMO was told, of vehicles that were still there one step later.
+        changed: of these, the ones that SUMO changed, by the checks that its speed mode leaves on.
     """
 
     steps: int = 0

@@ -29,7 +29,6 @@ from cfx.plugin import (
     registry,
     require_no_further_signals,
     threads,
-    traffic_table,
 )
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
@@ -306,9 +305,7 @@ class Driver:
             )
         elif drivers is not None:
             words = "all vehicles have one average driver"
-        if traffic_table.is_for_traffic(self.source):
-            return words
-        return f"{words}. {self.source} {traffic_table.NOT_FOR_TRAFFIC}"
+        return words
 
     def time_gaps(self, vehicles: Iterable[str]) -> Tensor:
         """Returns the time gaps of those that the model drives faster than walking, `(d,)`, s."""

@@ -1,6 +1,6 @@
 """How much of real time live drivers take in SUMO, beside SUMO alone in the same run.
 
-    python -m plugins.cfx-sumo.tests.benchmarks.live_speed cfx://i80-idm --vehicles 10 100 1000 5000
+    python -m plugins.cfx-sumo.tests.benchmarks.live_speed cfx://idm --vehicles 10 100 1000 5000
 
 Lanes of 50 vehicles behind heads at 14 m/s, steps of 0.1 s, libsumo in one process for each row. A
 row has processor time: how many times real time SUMO alone takes, how many with drivers, and what a
