@@ -53,7 +53,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         >>> from cfx.sklearn import CarFollowingRegressor
         >>> from sklearn.model_selection import GridSearchCV, GroupKFold
         >>> table = cfx.read(dataset="synthetic", pairs=4, frames=120).frame
-        >>> settings = {"optimizer": "random", "optimizer.samples": 64}
+        >>> settings = {"optimizer": "random", "optimizer.samples": 64, "calibration.prior": "weak"}
         >>> regressor = CarFollowingRegressor(settings=settings)
         >>> search = GridSearchCV(regressor, {"model": ["idm", "krauss"]}, cv=GroupKFold(2))
         >>> search.fit(table, groups=table["pair_id"]).best_params_["model"] in {"idm", "krauss"}

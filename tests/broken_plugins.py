@@ -17,6 +17,7 @@ QUICK = (
     "data.frames=150",
     "optimizer=random",
     "optimizer.samples=16",
+    "calibration.prior=weak",
     "policy=fixed",
     "figures=none",
     "tracking.enabled=false",

@@ -16,6 +16,7 @@ JOB = [
     "model=w99",
     "model.parameters.b.tuned=true",
     "policy=fixed",
+    "calibration.prior=weak",
 ]
 """W99's deceleration b has no effect below its brake cap, 9 m/s2, so that its loss is flat for
 every driver where a job tunes it."""

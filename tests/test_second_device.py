@@ -25,6 +25,7 @@ _SMALL = [
     "data.frames=80",
     "policy=fixed",
     "optimizer.samples=16",
+    "calibration.prior=weak",
     "figures=none",
     "tracking.enabled=false",
     "cache.enabled=false",

@@ -155,7 +155,7 @@ def train(
         >>> import cfx
         >>> pairs = cfx.read(dataset="synthetic", pairs=4, frames=300)
         >>> small = {"learner.epochs": 1, "learner.ensemble_size": 1, "protocol.folds": 2}
-        >>> small |= {"optimizer": "random", "optimizer.samples": 64}
+        >>> small |= {"optimizer": "random", "optimizer.samples": 64, "calibration.prior": "weak"}
         >>> result = cfx.train(pairs, "idm", **small)
         >>> sorted(result.pairs["method"].unique())
         ['default', 'driver_specific', 'policy', 'pooled']

@@ -486,7 +486,7 @@ def compare(*jobs: Fit | Result, **named: Fit | Result) -> Comparison:
 
     Examples:
         >>> import cfx
-        >>> pairs = cfx.read(dataset="synthetic", pairs=4, frames=300)
+        >>> pairs = cfx.read(dataset="synthetic", pairs=2, frames=200)
         >>> fits = [cfx.calibrate(pairs, model) for model in ("idm", "krauss")]
         >>> sorted(cfx.compare(*fits).table.index)
         ['idm', 'krauss']

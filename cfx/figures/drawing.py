@@ -118,20 +118,31 @@ def write_figure(figure: Figure, path: Path) -> Path:
     Raises:
         OutputError: the file cannot be written.
     """
-    from cfx.figures.canvas import figure_style
-
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with atomic_write(path) as unfinished, figure_style():
-            form = path.suffix.removeprefix(".")
-            metadata: Any = FIGURE_METADATA[form]
-            figure.savefig(unfinished, format=form, metadata=metadata)
+        with atomic_write(path) as unfinished:
+            _print(figure, unfinished, path.suffix.removeprefix("."))
     except OSError as error:
         raise OutputError(
             f"{path}: this figure cannot be written ({error.strerror or error});"
             " free the path or choose another folder"
         ) from error
     return path
+
+
+def _print(figure: Figure, to: Path | io.BytesIO, form: str) -> None:
+    """Writes a figure in one of the formats of `FIGURE_METADATA`."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    from cfx.figures.canvas import figure_style
+
+    metadata: Any = FIGURE_METADATA[form]
+    with figure_style():
+        if form == "png":
+            # `savefig` writes the same bytes, but draws twice, once for the layout alone.
+            FigureCanvasAgg(figure).print_png(to, metadata=metadata)
+        else:
+            figure.savefig(to, format=form, metadata=metadata)
 
 
 def as_html(text: str, table: pd.DataFrame) -> str:
@@ -143,12 +154,10 @@ def as_html(text: str, table: pd.DataFrame) -> str:
 
 def for_notebooks(figure: Figure) -> Figure:
     """Returns a figure that notebooks show by themselves; pyplot knows nothing of it."""
-    from cfx.figures.canvas import figure_style
 
     def as_png() -> bytes:
         stream = io.BytesIO()
-        with figure_style():
-            figure.savefig(stream, format="png")
+        _print(figure, stream, "png")
         return stream.getvalue()
 
     vars(figure)["_repr_png_"] = as_png

@@ -19,7 +19,10 @@ from cfx.errors import CfxError, ConfigError, DataError, ParameterError
 from cfx.results.table import stored_tables
 from tests.checkout import needs
 
-RANDOM = {"optimizer": "random", "optimizer.samples": 256}
+WEAK = {"calibration.prior": "weak"}
+"""Choosing the prior's weight takes ten calibrations more."""
+RANDOM = {"optimizer": "random", "optimizer.samples": 256, **WEAK}
+OFF = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
 LEADER = pd.DataFrame({"time_s": np.arange(600) * 0.1, "speed": 15.0})
 
 
@@ -47,9 +50,8 @@ def fit(pairs: cfx.Pairs) -> cfx.Fit:
     return cfx.calibrate(pairs, "idm", objective="gap_rmse", seed=3, **RANDOM)
 
 
-@pytest.fixture(scope="module")
-def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
-    """The job of the fit's command."""
+def job_of(fit: cfx.Fit, folder: Path) -> Job:
+    """Runs the command of a fit."""
     found = []
     calibrated = Calibrator.driver_specific
 
@@ -57,16 +59,27 @@ def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
         found.append(calibrated(self, *given))
         return found[-1]
 
-    off = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
-    folder = tmp_path_factory.mktemp("job") / "out"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(Calibrator, "driver_specific", recorded)
-        cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
+        cfx.run([*shlex.split(fit.command)[3:], *OFF, f"hydra.run.dir={folder}"])
     return Job(found[0], stored_tables(folder)["fits"])
+
+
+@pytest.fixture(scope="module")
+def job(fit: cfx.Fit, tmp_path_factory: pytest.TempPathFactory) -> Job:
+    """The job of the fit's command."""
+    return job_of(fit, tmp_path_factory.mktemp("job") / "out")
 
 
 def test_parameters_are_those_of_the_command_to_the_last_bit(fit: cfx.Fit, job: Job) -> None:
     assert fit.parameters.to_numpy().tolist() == job.found.tolist()
+
+
+def test_a_chosen_prior_is_that_of_the_command_to_the_last_bit(tmp_path: Path) -> None:
+    made = cfx.read(dataset="synthetic", pairs=2, frames=120).save(tmp_path / "pairs.parquet")
+    chosen = {"optimizer": "random", "optimizer.samples": 16}
+    fit = cfx.calibrate(made, "krauss", **chosen)
+    assert fit.parameters.to_numpy().tolist() == job_of(fit, tmp_path / "out").found.tolist()
 
 
 def test_errors_are_those_of_the_command(fit: cfx.Fit, job: Job) -> None:
@@ -98,9 +111,8 @@ def test_a_posterior_is_that_of_the_command_and_gives_new_drivers(
     pairs: cfx.Pairs, tmp_path: Path
 ) -> None:
     fit = cfx.calibrate(pairs, "krauss", **RANDOM, **{"calibration.posterior": "hierarchical"})
-    off = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
     folder = tmp_path / "job"
-    cfx.run([*shlex.split(fit.command)[3:], *off, f"hydra.run.dir={folder}"])
+    cfx.run([*shlex.split(fit.command)[3:], *OFF, f"hydra.run.dir={folder}"])
     fits = pd.read_parquet(folder / "fits.parquet")
     its = fits[fits["method"] == "driver_specific"].set_index("pair_id")
     pd.testing.assert_frame_equal(fit.intervals, its[fit.intervals.columns], check_names=False)
@@ -251,7 +263,7 @@ def test_what_was_read_can_be_saved_though_it_would_be_refused(
 
 
 def test_pairs_of_a_data_frame_have_no_command(pairs: cfx.Pairs) -> None:
-    fit = cfx.calibrate(cfx.read(pairs.frame, min_duration=0), "idm", optimizer="random")
+    fit = cfx.calibrate(cfx.read(pairs.frame, min_duration=0), "idm", **RANDOM)
     with pytest.raises(DataError, match="save them first"):
         _ = fit.command
 
@@ -423,7 +435,7 @@ def test_what_is_no_recording_is_said(given: Any) -> None:
 def test_a_fit_says_whether_it_is_the_optimum(
     pairs: cfx.Pairs, fit: cfx.Fit, tmp_path: Path
 ) -> None:
-    found = cfx.calibrate(pairs, "krauss")
+    found = cfx.calibrate(pairs, "krauss", **WEAK)
     assert bool((found.ends_apart < 0.01).all())
     again = cfx.Fit.load(found.save(tmp_path / "fit"))
     pd.testing.assert_series_equal(again.ends_apart, found.ends_apart)
@@ -457,7 +469,7 @@ def test_what_was_minimised_comes_first(fit: cfx.Fit) -> None:
 
 def test_a_fit_drives_other_drivers_with_its_pooled_parameters(fit: cfx.Fit) -> None:
     others = cfx.read(dataset="synthetic", pairs=2, frames=300, seed=5)
-    tested = cfx.evaluate(fit, others, optimizer="random", **{"optimizer.samples": 64})
+    tested = cfx.evaluate(fit, others, **RANDOM)
     assert tested.judge.name == "rmse_gap"  # what the fit minimised
     rows = tested.pairs[tested.pairs["method"] == "pooled"]
     chosen = rows.filter(like="parameter_").rename(columns=lambda one: one[len("parameter_") :])
@@ -475,8 +487,7 @@ def test_fits_are_compared_by_their_errors_on_the_test_part(fit: cfx.Fit) -> Non
         fit.recorded,
         fit.model,
         objective="gap_rmse",
-        optimizer="random",
-        **{"optimizer.samples": 2},
+        **{**RANDOM, "optimizer.samples": 2},
     )
     compared = cfx.compare(fit, worse, again=fit)
     assert set(compared.ranking.jobs) == {"idm", "idm'", "again"}

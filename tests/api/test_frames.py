@@ -117,22 +117,28 @@ READ: dict[str, Callable[[], Any]] = {
 }
 
 
+@pytest.fixture(scope="module")
+def wanted() -> list[str]:
+    """What is read of each pair of a data frame."""
+    return [pair.content for pair in cfx.read(FRAME, **SETTINGS).selected]
+
+
 @pytest.mark.parametrize("name", READ)
-def test_every_table_is_the_same_recording(name: str) -> None:
-    wanted = cfx.read(FRAME, **SETTINGS).selected
+def test_every_table_is_the_same_recording(name: str, wanted: list[str]) -> None:
     read = cfx.read(READ[name](), **SETTINGS).selected
-    assert [pair.content for pair in read] == [pair.content for pair in wanted]
+    assert [pair.content for pair in read] == wanted
 
 
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 @pytest.mark.parametrize("kind", ["int64", "uint64", "Int64", "float64"])
-def test_times_that_are_whole_numbers(unit: str, kind: str, tmp_path: Path) -> None:
+def test_times_that_are_whole_numbers(
+    unit: str, kind: str, tmp_path: Path, wanted: list[str]
+) -> None:
     per_second = {"ms": 10**3, "us": 10**6, "ns": 10**9}[unit]
     count = 1_767_225_600 * per_second + FRAME["frame"] * (per_second // 10)
     frame = FRAME.assign(t=count.astype(kind)).drop(columns="time_s")
     frame.to_parquet(tmp_path / "t.parquet")
     frame.to_csv(tmp_path / "t.csv", index=False)
-    wanted = [pair.content for pair in cfx.read(FRAME, **SETTINGS).selected]
     for source in (frame, pl.from_pandas(frame), tmp_path / "t.parquet", tmp_path / "t.csv"):
         read = cfx.read(source, columns={"time": "t"}, units={"time": unit}, **SETTINGS).selected
         assert [pair.content for pair in read] == wanted

@@ -15,10 +15,9 @@ import cfx
 from cfx.errors import ConfigError, DataError
 from tests.checkout import needs
 
-RANDOM = {"optimizer": "random", "optimizer.samples": 64}
+RANDOM = {"optimizer": "random", "optimizer.samples": 64, "calibration.prior": "none"}
 SMALL = {
     **RANDOM,
-    "calibration.prior": "none",
     "learner.epochs": 1,
     "learner.steps": 3,
     "learner.horizon": 6,

@@ -32,7 +32,7 @@ CHECKS = (
 """Those that feed no arrays of random numbers."""
 
 
-SETTINGS = {"optimizer": "random", "optimizer.samples": 64}
+SETTINGS = {"optimizer": "random", "optimizer.samples": 64, "calibration.prior": "weak"}
 
 
 @pytest.fixture(scope="module")

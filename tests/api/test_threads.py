@@ -23,7 +23,7 @@ from hydra.version import VersionBase
 import cfx
 from cfx.app import hydra_source
 
-SMALL = {"optimizer": "random", "optimizer.samples": 16}
+SMALL = {"optimizer": "random", "optimizer.samples": 16, "calibration.prior": "weak"}
 POLICY = "cfx://idm"
 
 

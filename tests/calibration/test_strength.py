@@ -14,7 +14,7 @@ from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.calibration.strength import FITTED, WEIGHTS, PriorStrength
 from cfx.data.pairs import PairBatch
-from cfx.models.idm import IDM
+from cfx.models.krauss import Krauss
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
 
@@ -31,7 +31,7 @@ def test_it_is_where_a_parabola_has_the_least_error_for_all_that_may_be_used() -
 @pytest.fixture
 def calibrator() -> Calibrator:
     solver = Solver(
-        MemoryStepper(IDM(), 0.1), RandomSearch(samples=64), 0, prior=0.01, chooses_prior=True
+        MemoryStepper(Krauss(), 0.1), RandomSearch(samples=64), 0, prior=0.01, chooses_prior=True
     )
     return Calibrator(solver, cache=Cache(None))
 

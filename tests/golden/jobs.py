@@ -21,6 +21,7 @@ SMALL = (
     "cores=1",
     "figures=none",
     "tracking.enabled=false",
+    "calibration.prior=chosen",
 )
 _ACROSS = ("data.pairs=6", "protocol=across_drivers", "protocol.folds=2")
 _ROLLOUT = (

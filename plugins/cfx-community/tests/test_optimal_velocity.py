@@ -174,6 +174,7 @@ def test_a_job_runs_with_the_preset_for_city_traffic(tmp_path, monkeypatch) -> N
         "data.frames=200",
         "optimizer=random",
         "optimizer.samples=64",
+        "calibration.prior=weak",
     ]
     overrides += ["protocol=within_driver", "data=synthetic"]
     result = cfx.run([*overrides, "policy=fixed", "tracking.enabled=false", "figures=none"])

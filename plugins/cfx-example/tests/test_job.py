@@ -12,7 +12,8 @@ from cfx.plugin import main
 
 COMPONENTS = (
     "model=helly simulator=mean_speed engine=thread_pool objective=gap_mae optimizer=halton_search"
-    " optimizer.samples=64 calibration.posterior=abc_rejection policy=linear_map learner=best_of_quick"
+    " optimizer.samples=64 calibration.prior=weak calibration.posterior=abc_rejection"
+    " policy=linear_map learner=best_of_quick"
     " learner.epochs=2 protocol=first_part metrics=[own,time_gap] tables=[own,speed_bins] demo=ranking"
     " tracking.name=run_list"
 )
@@ -74,9 +75,8 @@ def test_other_commands_read_it(job: Path, capsys: pytest.CaptureFixture[str]) -
 
 def test_a_recurrent_policy_drives_with_its_head(job: Path) -> None:
     words = "model=helly optimizer=random optimizer.samples=32 policy=gru learner.head=nearby"
-    words += (
-        " learner.epochs=1 data.pairs=2 data.frames=400 protocol.folds=2 tracking.enabled=false"
-    )
+    words += " calibration.prior=weak learner.epochs=1 data.pairs=2 data.frames=400"
+    words += " protocol.folds=2 tracking.enabled=false"
     assert main([*words.split(), f"hydra.run.dir={job.parent / 'headed'}"]) == 0
     policy = json.loads((job.parent / "headed" / "policy" / "policy.json").read_text())
     assert "nearby" in json.dumps(policy)

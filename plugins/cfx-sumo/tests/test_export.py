@@ -29,6 +29,7 @@ CALIBRATED = (
     "data.frames=150",
     "optimizer=random",
     "optimizer.samples=32",
+    "calibration.prior=weak",
     "figures=none",
     "tracking.enabled=false",
     "hydra.run.dir=job",

@@ -36,6 +36,7 @@ QUICK = [
     "data.max_pairs=3",
     "optimizer=random",
     "optimizer.samples=12",
+    "calibration.prior=weak",
     "policy=fixed",
     "figures=none",
     "tracking.enabled=false",
@@ -49,9 +50,9 @@ def job(folder: Path, *overrides: str) -> Any:
 
 @needs_sumo
 def test_the_table_is_the_same_with_sumo_in_the_loop(tmp_path: Path) -> None:
-    same = ("model=krauss_sumo", "calibration.prior=weak")
-    memory = job(tmp_path / "memory", *same)
-    sumo = job(tmp_path / "sumo", *same, "simulator=sumo", "simulator.followers=8")
+    same = "model=krauss_sumo"
+    memory = job(tmp_path / "memory", same)
+    sumo = job(tmp_path / "sumo", same, "simulator=sumo", "simulator.followers=8")
     # Slices of the loss, which flatness is read from, are not simulated in SUMO.
     slices = [name for name in memory.pairs if name.startswith("flat_")]
     assert slices

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.image import imread
 
@@ -50,7 +51,7 @@ def learned(curves: pd.DataFrame) -> Result:
     return dataclasses.replace(all_of(make_results(pairs=1, frames=5)), tables={"curves": curves})
 
 
-def unrendered(figure: Figure, file: Path, **options: object) -> None:
+def unrendered(canvas: FigureCanvasAgg, file: Path, **options: object) -> None:
     """Stands for Matplotlib's pixels where only names of files are looked at."""
     file.touch()
 
@@ -314,7 +315,7 @@ def test_history_is_drawn_from_least_to_most_with_its_intervals() -> None:
 def test_platoon_and_history_are_written_where_a_protocol_delivered_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Figure, "savefig", unrendered)
+    monkeypatch.setattr(FigureCanvasAgg, "print_png", unrendered)
     results = make_results(pairs=3, frames=20)
     history = make_history(results.evaluation.trajectories, GAINS)
     platoon = make_platoon({"policy": 2})
