@@ -1,47 +1,17 @@
 /* A driver as a co-simulation unit of FMI 3.0 (https://fmi-standard.org/docs/3.0.2/).
 
-   driver.h, made from the driver's ONNX graph, has the step of one driver: DT, SIGNALS, NOISE,
-   TOKEN, `struct remembered` and `driver_step`. Here are the functions that FMI asks for, what a
-   unit remembers, and steps of other lengths than the driver's.
+   driving.h has the driver. Here are the functions that FMI asks for.
 
    Value references: 0 is the time, 1 to SIGNALS are the inputs, then next_speed and acceleration,
    then the seed of a driver who leaves something to chance. */
 
-#include <math.h>
 #include <stdarg.h>
-#include <stdbool.h>
-#include <stddef.h>
-#include <stdint.h>
-#include <stdio.h>
-#include <stdlib.h>
-#include <string.h>
 
-#if defined(_WIN32)
-#define EXPORT __declspec(dllexport)
-#else
-#define EXPORT __attribute__((visibility("default")))
-#endif
+#include "driving.h"
 
-#include "driver.h"
-
-typedef enum { OK, WARNING, DISCARD, ERROR, FATAL } status; /* fmi3Status */
 typedef void (*log_message)(void *environment, status status, const char *category, const char *message);
 
-enum { TIME = 0, NEXT_SPEED = SIGNALS + 1, ACCELERATION, SEED };
-/* Among the inputs: the first five signals of every driver. */
-enum { EGO_SPEED = 1, EGO_ACCELERATION, LEADER_SPEED, LEADER_ACCELERATION, GAP };
-
-#define SHORTEST 1e-9 /* s: what is left of a step below it is rounding */
-
-/* All that changes while a unit is simulated, so that a state is a copy of it. */
-struct state {
-    double value[ACCELERATION + 1];
-    int32_t seed;
-    uint64_t random;
-    double due;  /* s until the driver decides again */
-    double held; /* m/s2: what it has decided */
-    struct remembered remembered;
-};
+enum { SEED = ACCELERATION + 1 };
 
 struct unit {
     struct state state;
@@ -57,72 +27,6 @@ static void say(struct unit *unit, status status, const char *category, const ch
     vsnprintf(message, sizeof message, format, values);
     va_end(values);
     unit->log(unit->environment, status, category, message);
-}
-
-static void begin(struct unit *unit) {
-    memset(&unit->state, 0, sizeof unit->state);
-    unit->state.value[EGO_SPEED] = unit->state.value[LEADER_SPEED] = 10.0;
-    unit->state.value[GAP] = 30.0;
-    unit->state.value[NEXT_SPEED] = unit->state.value[EGO_SPEED];
-}
-
-/* SplitMix64 (Steele, Lea and Flood 2014, Fast splittable pseudorandom number generators). */
-static uint64_t random_bits(uint64_t *random) {
-    uint64_t bits = (*random += 0x9E3779B97F4A7C15u);
-    bits = (bits ^ (bits >> 30)) * 0xBF58476D1CE4E5B9u;
-    bits = (bits ^ (bits >> 27)) * 0x94D049BB133111EBu;
-    return bits ^ (bits >> 31);
-}
-
-/* A standard normal number (Box and Muller 1958). */
-static double normal(uint64_t *random) {
-    double first = (double)((random_bits(random) >> 11) + 1) * 0x1.0p-53; /* (0, 1] */
-    double second = (double)(random_bits(random) >> 11) * 0x1.0p-53;
-    return sqrt(-2.0 * log(first)) * cos(6.283185307179586 * second);
-}
-
-/* Lets the driver decide; NaN where an input is not a number. */
-static double decide(struct state *state, const double signal[SIGNALS]) {
-    struct remembered after;
-    double noise[NOISE + 1], speed;
-    uint64_t random = state->random;
-    for (int k = 0; k < NOISE; k++) noise[k] = normal(&random);
-    driver_step(signal, &state->remembered, noise, &speed, &after);
-    if (isnan(speed)) return NAN;
-    state->random = random;
-    state->remembered = after;
-    return speed;
-}
-
-/* Simulates a communication step of any length. The driver decides every DT and holds its
-   acceleration in between. Within a step that is longer, the vehicle ahead keeps the acceleration
-   that it has at the begin. */
-static status advance(struct unit *unit, double length) {
-    struct state next = unit->state;
-    double signal[SIGNALS], left = length;
-    memcpy(signal, next.value + 1, sizeof signal);
-    double *speed = &signal[EGO_SPEED - 1], *ahead = &signal[LEADER_SPEED - 1];
-    double *gap = &signal[GAP - 1];
-    while (left > SHORTEST) {
-        if (next.due <= SHORTEST) {
-            double decided = decide(&next, signal);
-            if (isnan(decided)) return DISCARD;
-            next.held = (decided - *speed) / DT;
-            next.due = DT;
-        }
-        double part = fmin(next.due, left);
-        /* The models integrate by forward Euler: vehicles move by their new speeds. */
-        *speed = fmax(0.0, *speed + next.held * part);
-        *ahead = fmax(0.0, *ahead + signal[LEADER_ACCELERATION - 1] * part);
-        *gap += (*ahead - *speed) * part;
-        signal[EGO_ACCELERATION - 1] = next.held;
-        next.due -= part;
-        left -= part;
-    }
-    next.value[NEXT_SPEED] = *speed;
-    next.value[ACCELERATION] = (*speed - next.value[EGO_SPEED]) / length;
-    unit->state = next;
-    return OK;
 }
 
 /* --- Instances ------------------------------------------------------------------------------- */
@@ -149,7 +53,7 @@ EXPORT void *fmi3InstantiateCoSimulation(
         free(unit);
         return NULL;
     }
-    begin(unit);
+    begin(&unit->state);
     return unit;
 }
 
@@ -162,11 +66,8 @@ EXPORT status fmi3EnterInitializationMode(
     return OK;
 }
 
-/* Begins a driver; until the first step the speed stays. */
 EXPORT status fmi3ExitInitializationMode(void *instance) {
-    struct state *state = &((struct unit *)instance)->state;
-    state->random = (uint64_t)(uint32_t)state->seed;
-    state->value[NEXT_SPEED] = state->value[EGO_SPEED];
+    start(&((struct unit *)instance)->state);
     return OK;
 }
 
@@ -176,7 +77,7 @@ EXPORT status fmi3Terminate(void *instance) {
 }
 
 EXPORT status fmi3Reset(void *instance) {
-    begin(instance);
+    begin(&((struct unit *)instance)->state);
     return OK;
 }
 
@@ -245,7 +146,7 @@ EXPORT status fmi3DoStep(
         say(unit, ERROR, "logStatusError", "a step of %g s does not go on; give one above 0", length);
         return ERROR;
     }
-    if (advance(unit, length) != OK) {
+    if (advance(&unit->state, length) != OK) {
         say(unit, DISCARD, "logStatusDiscard",
             "the step is discarded, as an input is not a number (ego_speed=%g, leader_speed=%g,"
             " gap=%g); set each of them, and gap to infinity where nobody is ahead",

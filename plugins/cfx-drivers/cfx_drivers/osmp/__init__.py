@@ -1,0 +1,1 @@
+"""A driver as an OSI traffic participant: a unit with the variables of OSMP."""
