@@ -140,7 +140,8 @@ def _print(figure: Figure, to: Path | io.BytesIO, form: str) -> None:
     with figure_style():
         if form == "png":
             # `savefig` writes the same bytes, but draws twice, once for the layout alone.
-            FigureCanvasAgg(figure).print_png(to, metadata=metadata)
+            canvas: Any = FigureCanvasAgg(figure)  # Matplotlib does not type print_png
+            canvas.print_png(to, metadata=metadata)
         else:
             figure.savefig(to, format=form, metadata=metadata)
 

@@ -2,10 +2,10 @@
 
 python follow.py driver.osmp.fmu pairs.csv > ego.csv
 
-pairs.csv has cfx's tidy layout: time_s, leader_speed_mps, follower_speed_mps, gap_m (or any table
-with these columns). FMPy loads the unit, OSI's Python package makes the messages; this program is
-the simulator: it moves the leader, tells of both vehicles, and puts the ego vehicle where the unit
-says.
+pairs.csv has cfx's tidy layout: time_s, leader_speed_mps, follower_speed_mps and gap_m, or in place
+of the gap leader_position_m, leader_length_m and follower_position_m. FMPy loads the unit, OSI's
+Python package makes the messages; this program is the simulator: it moves the leader, tells of both
+vehicles, and puts the ego vehicle where the unit says.
 """
 
 import csv
@@ -101,6 +101,14 @@ def follow(
         driver.close()
 
 
+def gap_of(row: dict[str, str]) -> float:
+    """Returns the gap of a row of the table, bumper to bumper, m."""
+    if "gap_m" in row:
+        return float(row["gap_m"])
+    rear = float(row["leader_position_m"]) - float(row["leader_length_m"])
+    return rear - float(row["follower_position_m"])
+
+
 def main() -> None:
     """Prints the drive behind the first pair's leader."""
     with Path(sys.argv[2]).open(newline="") as file:
@@ -109,7 +117,7 @@ def main() -> None:
     rows = [row for row in rows if row.get("pair_id") == pair]
     time = [float(row["time_s"]) for row in rows]
     leader_speed = [float(row["leader_speed_mps"]) for row in rows]
-    start = float(rows[0]["follower_speed_mps"]), float(rows[0]["gap_m"])
+    start = float(rows[0]["follower_speed_mps"]), gap_of(rows[0])
     print("time_s", "leader_speed_mps", "ego_speed_mps", "gap_m", sep=",")
     for frame in follow(sys.argv[1], time, leader_speed, *start):
         print(*(f"{value:.6f}" for value in frame), sep=",")
