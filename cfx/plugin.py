@@ -19,7 +19,6 @@ MODULES = {
     "composed": "cfx.models.composed",
     "comparison": "cfx.results.comparison",
     "console": "cfx.core.console",
-    "curves": "cfx.learners.curves",
     "distributions": "cfx.core.distributions",
     "drawing": "cfx.figures.drawing",
     "engine": "cfx.core.engine",

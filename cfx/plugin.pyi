@@ -160,7 +160,6 @@ from .policies.known_drivers import (
 from .policies.ready import READY_FOLDER as READY_FOLDER, traffic_table as traffic_table
 
 # Learners
-from .learners import curves as curves
 from .learners.base import (
     Learner as Learner,
     TrainingData as TrainingData,
@@ -184,9 +183,9 @@ from .evaluation.metrics.base import (
     RECORDED as RECORDED,
     SCOPES as SCOPES,
     Trajectories as Trajectories,
-    column_of as column_of,
     key_of as key_of,
 )
+from .evaluation.protocols.agents import AgentBuilder as AgentBuilder
 from .evaluation.protocols.base import (
     Protocol as Protocol,
     ProtocolContext as ProtocolContext,

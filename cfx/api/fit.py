@@ -113,7 +113,7 @@ class Fit:
         context = self._context
         with visit():
             values = self._tensor("pooled")[:1]
-            agent = context.constant(FixedPolicy(), values)
+            agent = context.agents.constant(FixedPolicy(), values)
         return replace(agent, names=(ANY_DRIVER,), pooled=values.cpu())
 
     @cached_property
@@ -345,7 +345,7 @@ class Fit:
         if method == "driver_specific" and self.ends_apart.notna().any():
             errors["ends_apart"] = self.ends_apart.to_numpy()
         if context.split < 1:
-            agent = context.constant(FixedPolicy(), parameters)
+            agent = context.agents.constant(FixedPolicy(), parameters)
             each = torch.arange(len(batch), device=batch.lengths.device)
             loop = simulate_in_shards(
                 context.engine, context.stepper, agent, Followers(batch, each), first

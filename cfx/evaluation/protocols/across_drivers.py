@@ -250,13 +250,13 @@ class AcrossDrivers(Protocol):
         s = self.settings
         names = (*(f"fold {number}" for number in range(len(members) - 1)), ANY_DRIVER)
         if not context.policy.trainable:
-            training_result = context.untrained(context.policy, found.start)
-            policy = context.ready(context.policy, training_result, names)
+            training_result = context.agents.untrained(context.policy, found.start)
+            policy = context.agents.trained(context.policy, training_result, names)
             return replace(policy, pooled=found.pooled), training_result
         self._warn(context)
         training_data = _training_data(context, full, members, found, names)
         training_result = context.learner.fit(context.policy, training_data)
-        policy = context.ready(context.policy, training_result, names)
+        policy = context.agents.trained(context.policy, training_result, names)
         rule = ContextRule(
             driver_specific=s.base == "driver_specific",
             shrinkage=s.shrinkage if s.base == "driver_specific" else 0.0,

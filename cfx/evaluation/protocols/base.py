@@ -11,18 +11,16 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import pandas as pd
-import torch
 from torch import Tensor
 
 from cfx.calibration.calibrator import Calibrator, WindowLabels
 from cfx.calibration.objectives import Objective
-from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.engine import Engine
 from cfx.core.parameters import ParameterSpace
 from cfx.data.pairs import LearnedFrom, PairBatch, PairSet
 from cfx.data.style import StyleResult
-from cfx.errors import ConfigError, DataError, PluginError
+from cfx.errors import ConfigError, DataError
 from cfx.evaluation.closed_loop import (
     ClosedLoop,
     Followers,
@@ -31,22 +29,15 @@ from cfx.evaluation.closed_loop import (
 )
 from cfx.evaluation.evaluate import ComparedPairs, evaluate
 from cfx.evaluation.metrics.base import MetricSet
+from cfx.evaluation.protocols.agents import AgentBuilder
 from cfx.evaluation.result import Evaluation, Platoon
 from cfx.learners.base import (
-    CURVE_COLUMNS,
     Learner,
     TrainingData,
     TrainingPairs,
-    TrainingResult,
 )
-from cfx.policies.agent import Agent, TrainedOn
+from cfx.policies.agent import Agent
 from cfx.policies.base import Policy
-from cfx.policies.core import AgentCore
-from cfx.policies.features import Scaler, token_width
-from cfx.policies.heads import head_class, head_name
-from cfx.policies.heads.base import ParameterHead
-from cfx.policies.population import DriverPopulation
-from cfx.policies.valid_range import recorded_quantiles
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import Windows, WindowSettings
 
@@ -121,14 +112,18 @@ class ProtocolContext:
             )
 
     @cached_property
-    def _quantiles(self) -> dict[str, tuple[float, ...]]:
-        """`TrainedOn.quantiles` of all agents here."""
-        return recorded_quantiles(self.batch)
-
-    @cached_property
-    def _drivers(self) -> DriverPopulation | None:
-        """`TrainedOn.drivers` of trained agents here."""
-        return DriverPopulation.of(self.batch, self.policy.driver_features, self.pairs.drivers)
+    def agents(self) -> AgentBuilder:
+        """What makes agents of constant parameters and of trained networks."""
+        return AgentBuilder(
+            pairs=self.pairs,
+            batch=self.batch,
+            model_node=self.model_node,
+            policy_node=self.policy_node,
+            stepper=self.stepper,
+            learner=self.learner,
+            windows=self.windows,
+            seed=self.seed,
+        )
 
     def labels(self, counts: Tensor, fixed: Tensor) -> WindowLabels | None:
         """Calibrates parameters per window (labels), if the learner needs any.
@@ -226,88 +221,6 @@ class ProtocolContext:
         """Returns the model's default parameters `(n,)`, SI units, in the dtype of others."""
         return self.space.defaults(dtype=like.dtype, device=like.device)
 
-    def constant(self, policy: Policy, parameters: Tensor) -> Agent:
-        """Returns an agent of a policy as built, without training: the baselines.
-
-        Args:
-            policy: the component.
-            parameters: `(N, n)`, SI units: what `policy=fixed` answers, and recurrent networks
-                start from; one network for each row.
-        """
-        names = tuple(str(number) for number in range(len(parameters)))
-        return self.ready(policy, self.untrained(policy, parameters), names)
-
-    def untrained(self, policy: Policy, parameters: Tensor) -> TrainingResult:
-        """Returns a policy's networks as built; see `constant`.
-
-        They are in double precision, so that constants stay what calibration found.
-        """
-        space = self.stepper.model.space
-        width = token_width(policy.inputs, policy.summary, self.windows.length)
-        unit = space.to_unit(parameters.cpu())
-        network = policy.build(
-            width, space.to_unit(space.defaults()), unit, torch.Generator().manual_seed(self.seed)
-        )
-        scaler = Scaler(unit.new_zeros((len(unit), width)), unit.new_ones((len(unit), width)))
-        device = parameters.device
-        return TrainingResult(
-            network.to(device).eval(),
-            scaler.to(device),
-            pd.DataFrame(columns=CURVE_COLUMNS),
-            head=policy.untrained_head,
-        )
-
-    def ready(
-        self, policy: Policy, training_result: TrainingResult, names: tuple[str, ...]
-    ) -> Agent:
-        """Returns an agent of trained networks; `names` says what each is for.
-
-        Raises:
-            PluginError: the learner or the policy did not deliver such networks.
-        """
-        who = registry.origin(self.learner if policy.trainable else policy)
-        if not isinstance(training_result, TrainingResult):
-            raise PluginError(
-                f"{who}: fit must return a cfx.plugin.TrainingResult, but returned a"
-                f" {type(training_result).__name__}"
-            )
-        head = self._head(policy, training_result)
-        _check_networks(who, training_result, len(names), head.answers)
-        # Constant parameters are calibrated on these pairs, too.
-        learned_from = {pair.likeness: pair.driver for pair in self.pairs}
-        return Agent(
-            core=AgentCore(policy, training_result.network, training_result.scaler, head),
-            model_node=self.model_node,
-            policy_node=self.policy_node,
-            windows=self.windows,
-            dt=self.stepper.dt,
-            names=names,
-            base=training_result.base,
-            trained_on=TrainedOn(
-                learned_from, self._quantiles, drivers=self._drivers if policy.trainable else None
-            ),
-            valid_range=training_result.valid_range,
-            dispersion=training_result.dispersion,
-        )
-
-    def _head(self, policy: Policy, training_result: TrainingResult) -> ParameterHead:
-        """Returns the head that the learner trained its networks for."""
-        has_base = training_result.base is not None
-        name = training_result.head or head_name(has_base=has_base)
-        if name not in registry.names("head"):
-            raise PluginError(
-                f"{registry.origin(self.learner)} breaks its contract: there is no head '{name}';"
-                f" write one of {', '.join(registry.names('head'))}"
-            )
-        model = self.stepper.model
-        head = head_class(name).for_model(model, training_result.scaler.mean.device)
-        if policy.trainable and head.model_space != model.adaptation_space:
-            log.info(
-                "model.adaptation_bounds changes nothing here: this policy answers parameters,"
-                " not offsets (learner=rollout, or learner.head=offset)"
-            )
-        return head
-
 
 @dataclass(frozen=True)
 class ProtocolResult:
@@ -330,34 +243,6 @@ class ProtocolResult:
     labels: WindowLabels | None
     notes: Mapping[str, Any] = field(default_factory=dict)
     calibration: Mapping[str, float] = field(default_factory=dict)
-
-
-@torch.no_grad()
-def _check_networks(
-    who: str, training_result: TrainingResult, networks: int, parameters: int
-) -> None:
-    """Asks the networks about one window, so that a wrong shape or dtype ends in a sentence."""
-    mean = training_result.scaler.mean
-    expected = (networks, 1, 1, parameters)
-    if mean.shape[0] == networks:
-        tokens = mean.new_zeros((networks, 1, 1, mean.shape[1]))
-        state = training_result.network.initial_state(networks, 1)
-        answer, _ = training_result.network(tokens, state)
-        finite = answer.isfinite().all() and mean.isfinite().all()
-        if answer.shape == expected and answer.dtype == mean.dtype and not bool(finite):
-            raise PluginError(
-                f"{who}: its networks answer numbers that are not finite; train with a smaller"
-                " learner.learning_rate, or repair it"
-            )
-        if answer.shape == expected and answer.dtype == mean.dtype:
-            return
-        got = (
-            f"its networks answer {tuple(answer.shape)} in {answer.dtype} where {expected} in"
-            f" {mean.dtype} are wanted"
-        )
-    else:
-        got = f"its scaler is for {mean.shape[0]} networks where {networks} are wanted"
-    raise PluginError(f"{who} breaks its contract: {got}")
 
 
 class Protocol(Component):

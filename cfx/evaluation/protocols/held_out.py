@@ -99,11 +99,11 @@ class HeldOut:
         context, networks = self.context, len(self.policy.names)
         default = context.defaults(self.driver_specific).expand(networks, -1)
         methods = {
-            "default": context.constant(DefaultPolicy(), default),
+            "default": context.agents.constant(DefaultPolicy(), default),
             "policy": self.policy,
         }
         if self.pooled is not None:
-            methods["pooled"] = context.constant(FixedPolicy(), self.pooled)
+            methods["pooled"] = context.agents.constant(FixedPolicy(), self.pooled)
         return methods
 
     def _test_part(self, methods: Mapping[str, Agent]) -> dict[str, ClosedLoop]:
@@ -163,7 +163,7 @@ class HeldOut:
 
     def _constant(self, parameters: Tensor) -> ClosedLoop:
         """Simulates the test part with constant parameters of each driver, `(Q, n)`."""
-        agent = self.context.constant(FixedPolicy(), parameters)
+        agent = self.context.agents.constant(FixedPolicy(), parameters)
         each = torch.arange(len(self.first), device=self.first.device)
         return self.context.simulated(agent, Followers(self.batch, each), self.first)
 
@@ -180,7 +180,9 @@ class HeldOut:
         agents: dict[str, tuple[Agent, Sequence[str]]] = {}
         for name, agent in methods.items():
             agents[name] = (agent, self.policy.names)
-        default = context.constant(DefaultPolicy(), context.defaults(self.driver_specific)[None])
+        default = context.agents.constant(
+            DefaultPolicy(), context.defaults(self.driver_specific)[None]
+        )
         agents["default"] = (default, ("any",))
         return measure_platoons(context.stepper.model, agents)
 

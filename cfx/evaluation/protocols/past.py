@@ -127,10 +127,12 @@ def past_errors(
             return _speed_errors(context.simulated(agent, followers, cut), batch, cut)
 
         of_policy = errors(policy, Followers(batch, network, base))
-        of_driver_specific = errors(context.constant(FixedPolicy(), early), Followers(batch, each))
+        of_driver_specific = errors(
+            context.agents.constant(FixedPolicy(), early), Followers(batch, each)
+        )
         own = of_driver_specific
         if residual:
-            start = context.constant(FixedPolicy(residual=True), early)
+            start = context.agents.constant(FixedPolicy(residual=True), early)
             own = errors(start, Followers(batch, each))
         frames = (first - cut).to(own)
         products = (

@@ -76,9 +76,11 @@ class WithinDriver(Protocol):
             training_data = context.training_data(training_pairs, names)
             training_result = context.learner.fit(context.policy, training_data)
         else:
-            training_result = context.untrained(context.policy, driver_specific)
-        policy = context.ready(context.policy, training_result, names)
-        first = (split.frame * (not whole)).to(batch.lengths.device)
+            training_result = context.agents.untrained(context.policy, driver_specific)
+        policy = context.agents.trained(context.policy, training_result, names)
+        first = split.frame.to(batch.lengths.device)
+        if whole:
+            first = torch.zeros_like(first)
         scopes = {"test": _test_part(context, policy, network, first, driver_specific)}
         tested = ComparedPairs(pairs, batch, first, context.style)
         platoon = self._platoons(context, policy, driver_specific)
@@ -108,7 +110,7 @@ class WithinDriver(Protocol):
         """Simulates platoons where one network drives any driver; otherwise None."""
         if self.settings.networks != "all" or not context.policy.trainable:
             return None
-        default = context.constant(DefaultPolicy(), driver_specific[:1])
+        default = context.agents.constant(DefaultPolicy(), driver_specific[:1])
         agents = {"default": (default, ("any",)), "policy": (policy, policy.names)}
         return measure_platoons(context.stepper.model, agents)
 
@@ -117,8 +119,8 @@ def _test_part(
     context: ProtocolContext, policy: Agent, network: Tensor, first: Tensor, driver_specific: Tensor
 ) -> dict[str, ClosedLoop]:
     """Simulates the test part of P pairs, from frames `first` `(P,)` on, by all methods."""
-    default = context.constant(DefaultPolicy(), driver_specific)
-    constant = context.constant(FixedPolicy(), driver_specific)
+    default = context.agents.constant(DefaultPolicy(), driver_specific)
+    constant = context.agents.constant(FixedPolicy(), driver_specific)
     each = torch.arange(len(first), device=first.device)
     alone = Followers(context.batch, each)
     learned = Followers(context.batch, network, base=driver_specific)

@@ -240,12 +240,15 @@ class Forecast(FoldsOrFinished):
         agents = {}
         for name, agent in test.methods_without_history().items():
             agents[name] = (agent, test.network)
-        agents["driver_specific"] = (context.constant(FixedPolicy(), test.driver_specific), each)
+        agents["driver_specific"] = (
+            context.agents.constant(FixedPolicy(), test.driver_specific),
+            each,
+        )
         residual = {"driver_specific_residual": (test.driver_specific, each)}
         if test.pooled is not None:
             residual["pooled_residual"] = (test.pooled, test.network)
         for name, (parameters, network) in residual.items():
-            agent = context.constant(FixedPolicy(residual=True), parameters)
+            agent = context.agents.constant(FixedPolicy(residual=True), parameters)
             if can_drive(context.stepper, agent):
                 agents[name] = (agent, network)
         for name, (agent, network) in agents.items():

@@ -318,7 +318,7 @@ def _constant_kinds(
     """Returns constant parameters of each test driver, `(P, n)`, without and with noise."""
     context = test.context
     each = torch.arange(len(test.pairs), device=parameters.device)
-    agent = context.constant(FixedPolicy(), parameters)
+    agent = context.agents.constant(FixedPolicy(), parameters)
     kinds = {name: _Kind(agent, agent.begin(each), draws=False)}
     if noise is None:
         time, scale = residual_noise(test, parameters, own=name == "driver_specific")
