@@ -27,13 +27,13 @@ def printable(text: str) -> str:
 
     Names in recordings may hold sequences that change a terminal's title or clear it.
     """
-    found = []
+    characters = []
     for character in text:
         if character.isprintable() or character in "\n\t":
-            found.append(character)
+            characters.append(character)
         else:
-            found.append(character.encode("unicode_escape").decode())
-    return "".join(found)
+            characters.append(character.encode("unicode_escape").decode())
+    return "".join(characters)
 
 
 def without_passwords(text: str) -> str:

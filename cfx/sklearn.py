@@ -144,8 +144,8 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         context, last = self._prepared(pairs)
         members = torch.ones((1, len(context.pairs)), dtype=torch.bool)
         with visit():
-            found = context.calibrator.pooled(context.pairs, context.batch, last, members)
-        return pd.Series(found[0].tolist(), index=list(context.space.names))
+            parameters = context.calibrator.pooled(context.pairs, context.batch, last, members)
+        return pd.Series(parameters[0].tolist(), index=list(context.space.names))
 
     def __sklearn_tags__(self) -> Tags:
         tags = super().__sklearn_tags__()

@@ -102,9 +102,9 @@ def config(pairs: PairsLike | None = None, /, **settings: Any) -> Experiment:
         if pairs is None:
             return Experiment(config_of(settings))
         recording = pairs_from(pairs, settings)
-        found = config_of(without_data(settings))
+        composed = config_of(without_data(settings))
         node = {"data": dict(recording.node)}
-        return Experiment(JobConfig.of({**found.model_dump(), **node}), recording)
+        return Experiment(JobConfig.of({**composed.model_dump(), **node}), recording)
 
 
 def from_config(job: Result | str | Path) -> Experiment:
@@ -211,10 +211,10 @@ def _objective_of(policy: PolicyLike) -> dict[str, Any]:
     else:
         of_fit: Experiment | None = getattr(policy, "experiment", None)
         node = {} if of_fit is None else of_fit.config.objective
-    found: dict[str, Any] = {}
+    objective: dict[str, Any] = {}
     for key, value in node.items():
-        found["objective" if key == "name" else f"objective.{key}"] = value
-    return found
+        objective["objective" if key == "name" else f"objective.{key}"] = value
+    return objective
 
 
 NOTHING_KEPT = {

@@ -95,8 +95,10 @@ class Fit:
         members = torch.ones((1, len(self._context.pairs)), dtype=torch.bool)
         context = self._context
         with visit():
-            found = context.calibrator.pooled(context.pairs, context.batch, self._last, members)
-        return pd.Series(found[0].tolist(), index=self.parameters.columns, name="pooled")
+            parameters = context.calibrator.pooled(
+                context.pairs, context.batch, self._last, members
+            )
+        return pd.Series(parameters[0].tolist(), index=self.parameters.columns, name="pooled")
 
     @property
     def defaults(self) -> pd.Series:
@@ -144,9 +146,9 @@ class Fit:
         table = self.parameters.describe().T[["mean", "std", "25%", "50%", "75%"]]
         units, at_bound = [], []
         for name in space.names:
-            one = space[name]
-            units.append(one.unit)
-            place = (self.parameters[name] - one.low) / (one.high - one.low)
+            parameter = space[name]
+            units.append(parameter.unit)
+            place = (self.parameters[name] - parameter.low) / (parameter.high - parameter.low)
             at_bound.append(float(((place < _AT_BOUND) | (place > 1 - _AT_BOUND)).mean()))
         table.insert(0, "unit", units)
         table.insert(1, "default", self.defaults)
@@ -177,11 +179,11 @@ class Fit:
         Raises:
             ConfigError: no posterior was asked for.
         """
-        found = self._posterior.draws
+        draws_by_driver = self._posterior.draws
         rows = pd.MultiIndex.from_product(
-            [self.parameters.index, range(found.shape[1])], names=["pair_id", "draw"]
+            [self.parameters.index, range(draws_by_driver.shape[1])], names=["pair_id", "draw"]
         )
-        return pd.DataFrame(found.flatten(0, 1).numpy(), rows, self.parameters.columns)
+        return pd.DataFrame(draws_by_driver.flatten(0, 1).numpy(), rows, self.parameters.columns)
 
     def inference_data(self) -> DataTree:
         """Returns the draws as ArviZ reads them: its InferenceData, an `xarray.DataTree`.
@@ -211,8 +213,8 @@ class Fit:
         """
         from cfx.calibration.posterior import posterior_method
 
-        asked = self.experiment.config.calibration.posterior
-        if asked == "none" or not posterior_method(asked).has_population:
+        posterior = self.experiment.config.calibration.posterior
+        if posterior == "none" or not posterior_method(posterior).has_population:
             raise ConfigError(f"there is no population to draw from; {_ask_for('hierarchical')}")
         names = [f"driver {number}" for number in range(drivers)]
         rows = self._posterior.draw_drivers(drivers, seed).numpy()
@@ -249,8 +251,8 @@ class Fit:
             from cfx.figures.drawing import for_notebooks
             from cfx.results.figures.pair_lines import drives
 
-            known = list(self.parameters.index)
-            chosen = chosen_names(pair_id, known, "the fit")
+            pair_ids = list(self.parameters.index)
+            chosen = chosen_names(pair_id, pair_ids, "the fit")
             return for_notebooks(drives(self.result, chosen))
         return self.result.plot(name)
 
@@ -258,7 +260,9 @@ class Fit:
         """Draws the parameters between their bounds, and how they go together."""
         from cfx.results.result import Result, described_parameters
 
-        tables = [self._of(one).add_prefix("parameter_").assign(method=one) for one in METHODS]
+        tables = [
+            self._of(method).add_prefix("parameter_").assign(method=method) for method in METHODS
+        ]
         rows = pd.concat(tables, ignore_index=True)
         described = {"parameters": described_parameters(self._context.space.tuned)}
         return Result(data=described, tables={"pairs": rows}).plot("calibration")
@@ -447,9 +451,9 @@ def calibrate(
     with visit():
         components, context, last = _context_of(experiment, recording)
         with closing(components.engine):
-            found = context.calibrator.driver_specific(context.pairs, context.batch, last)
+            calibrated = context.calibrator.driver_specific(context.pairs, context.batch, last)
     ids = pd.Index(context.pairs.ids, name="pair_id")
-    table = pd.DataFrame(found.cpu().numpy(), ids, list(context.space.names))
+    table = pd.DataFrame(calibrated.cpu().numpy(), ids, list(context.space.names))
     apart = pd.Series(context.calibrator.apart(context.pairs, last), ids, name="ends_apart")
     return Fit(experiment, recording, table, apart, context, last)
 

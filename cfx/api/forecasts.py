@@ -51,8 +51,8 @@ class Forecast:
             Index pair_id, time_s and quantile; columns speed (m/s) and travelled (m).
         """
         grouped = self.paths.groupby(["pair_id", "time_s"])[["speed", "travelled"]]
-        found: pd.DataFrame = grouped.quantile(np.array(levels))
-        return found.rename_axis(index=["pair_id", "time_s", "quantile"])
+        table: pd.DataFrame = grouped.quantile(np.array(levels))
+        return table.rename_axis(index=["pair_id", "time_s", "quantile"])
 
     def plot(self, pair_ids: PairIds | None = None) -> Figure:
         """Draws fans of paths and what happened; returns the figure.
@@ -63,8 +63,12 @@ class Forecast:
         from cfx.api.figures import draw_fans
         from cfx.figures.drawing import for_notebooks
 
-        known = list(self.paths["pair_id"].unique())
-        chosen = known[:3] if pair_ids is None else chosen_names(pair_ids, known, "the forecast")
+        pairs_known = list(self.paths["pair_id"].unique())
+        chosen = (
+            pairs_known[:3]
+            if pair_ids is None
+            else chosen_names(pair_ids, pairs_known, "the forecast")
+        )
         return for_notebooks(draw_fans(chosen, self.quantiles(), self.measured))
 
     def __repr__(self) -> str:
@@ -154,7 +158,7 @@ def forecast(
             base = base_of(agent, calibrated)[:, : calibrated.shape[1]]
         network = torch.zeros_like(origins.pair)
         followers = Followers(context.batch, network, base, agent.context_rule.history_s)
-        found = sample_from_origins(
+        paths = sample_from_origins(
             context.stepper,
             agent,
             followers,
@@ -163,7 +167,7 @@ def forecast(
             generators or [None],
             leader=leader,
         )
-        return _tables(context, origins, found, known_to_the_end=leader != "given")
+        return _tables(context, origins, paths, known_to_the_end=leader != "given")
 
 
 def _origins(context: ProtocolContext, at: float) -> Origins:
@@ -187,7 +191,7 @@ def _origins(context: ProtocolContext, at: float) -> Origins:
 
 
 def _tables(
-    context: ProtocolContext, origins: Origins, found: Paths, *, known_to_the_end: bool
+    context: ProtocolContext, origins: Origins, sampled: Paths, *, known_to_the_end: bool
 ) -> Forecast:
     """Returns paths `(S, P, K + 1)`, and what happened, as tables.
 
@@ -195,15 +199,15 @@ def _tables(
     """
     from cfx.evaluation.forecasts import measured_paths
 
-    steps = found.speed.shape[-1] - 1
+    steps = sampled.speed.shape[-1] - 1
     happened, recorded = measured_paths(context.batch, origins, steps)
     is_recorded = recorded.cpu().numpy().ravel()
     dt = context.batch.dt
     time = (int(origins.frame[0]) + np.arange(steps + 1)) * dt
     ids = context.pairs.ids
     paths = []
-    for number in range(len(found.speed)):
-        table = _long(ids, time, found.speed[number], found.travelled[number])
+    for number in range(len(sampled.speed)):
+        table = _long(ids, time, sampled.speed[number], sampled.travelled[number])
         table.insert(1, "path", number)
         paths.append(table if known_to_the_end else table[is_recorded])
     measured = _long(ids, time, happened.speed, happened.travelled)

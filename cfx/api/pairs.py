@@ -35,7 +35,7 @@ PairIds = str | float | Iterable[str | float]
 """Ids of pairs, or one; 10, 10.0, "10" and " 10" are the same."""
 
 
-def chosen_names(pair_ids: PairIds, known: Sequence[str], source: str) -> list[str]:
+def chosen_names(pair_ids: PairIds, available: Sequence[str], source: str) -> list[str]:
     """Returns the names of pairs that a caller chooses.
 
     Args:
@@ -48,8 +48,8 @@ def chosen_names(pair_ids: PairIds, known: Sequence[str], source: str) -> list[s
     """
     names = names_of(pair_ids)
     for name in names:
-        if name not in known:
-            raise DataError(f"{source}: there is no pair '{name}'.{nearest(name, known)}")
+        if name not in available:
+            raise DataError(f"{source}: there is no pair '{name}'.{nearest(name, available)}")
     twice = named_twice(names)
     if twice is not None:
         raise DataError(f"{source}: pair '{twice}' is named twice; name each pair once")
@@ -115,7 +115,7 @@ class Pairs:
     @property
     def dropped(self) -> pd.DataFrame:
         """What was left out: a row per reason, with its count and what was counted."""
-        rows = [(one.reason, one.count, one.unit) for one in self.selected.dropped]
+        rows = [(drop.reason, drop.count, drop.unit) for drop in self.selected.dropped]
         return pd.DataFrame(rows, columns=["reason", "count", "unit"])
 
     def select(self, pair_ids: PairIds) -> Pairs:
@@ -127,9 +127,9 @@ class Pairs:
         Raises:
             DataError: there is no pair of such an id, or one is named twice.
         """
-        known = self.selected.ids
-        chosen_ids = chosen_names(pair_ids, known, self.selected.source)
-        keep = [name in chosen_ids for name in known]
+        available = self.selected.ids
+        chosen_ids = chosen_names(pair_ids, available, self.selected.source)
+        keep = [name in chosen_ids for name in available]
         chosen = self.selected.select(keep, "not selected")
         node = {**self.node, "pair_ids": [pair.pair_id for pair in chosen]}
         return replace(self, selected=chosen, node=node)
@@ -183,9 +183,9 @@ class Pairs:
     def _left_out(self) -> str:
         """Says which pairs reading has left out."""
         reasons = []
-        for one in self.selected.dropped:
-            if one.unit == "pairs":
-                reasons.append(f"{one.count} {one.reason}")
+        for drop in self.selected.dropped:
+            if drop.unit == "pairs":
+                reasons.append(f"{drop.count} {drop.reason}")
         return f"; left out: {', '.join(reasons)}" if reasons else ""
 
     def _repr_html_(self) -> str:
@@ -233,7 +233,7 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
         made = validate(TidySettings, values, where="data")
         return Pairs(FrameDataset(made, frame).load(), node)
     paths = [source] if isinstance(source, str | Path) else _paths(source)
-    paths = [one if is_url(str(one)) else str(absolute(one)) for one in paths]
+    paths = [path if is_url(str(path)) else str(absolute(path)) for path in paths]
     own_columns = {"columns", "units"} & settings.keys()
     name = dataset or ("tidy" if own_columns else dataset_of(Path(str(paths[0]))))
     given["data.path"] = paths[0] if len(paths) == 1 else paths
@@ -253,13 +253,13 @@ def _paths(source: Any) -> list[str | Path]:
     Raises:
         ConfigError: it is no list of paths.
     """
-    found = list(source) if isinstance(source, list | tuple | set) else []
-    if not found or not all(isinstance(one, str | Path) for one in found):
+    paths = list(source) if isinstance(source, list | tuple | set) else []
+    if not paths or not all(isinstance(path, str | Path) for path in paths):
         raise ConfigError(
             f"a {type(source).__name__} of this kind is no recording; give a path, a list of paths,"
             " a data frame, or what cfx.read returned"
         )
-    return found
+    return paths
 
 
 def pairs_from(given: PairsLike, settings: Mapping[str, Any] | None = None) -> Pairs:

@@ -139,8 +139,8 @@ def simulate(
             batch.follower_speed[:, first],
             batch.follower_acceleration[:, first],
         )
-        found = rollout(made, given, ahead, start, batch.dt)
-        return _table(recording, found, start.acceleration, first)
+        trajectory = rollout(made, given, ahead, start, batch.dt)
+        return _table(recording, trajectory, start.acceleration, first)
 
 
 def _recording(
@@ -266,20 +266,20 @@ def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict
     return values
 
 
-def _table(pairs: PairSet, found: Trajectory, at_start: Tensor, first: int) -> pd.DataFrame:
+def _table(pairs: PairSet, trajectory: Trajectory, at_start: Tensor, first: int) -> pd.DataFrame:
     """Returns a row per follower and frame; `at_start` are the followers' first accelerations."""
     parts = []
     for number, pair in enumerate(pairs):
         count = len(pair) - first
-        speed = found.speed[number, :count].numpy()
+        speed = trajectory.speed[number, :count].numpy()
         columns = {
             "pair_id": pair.pair_id,
             "time_s": (first + np.arange(count)) * pair.dt,
             "leader_speed": np.asarray(pair.leader_speed)[first:],
-            "position": found.position[number, :count].numpy(),
+            "position": trajectory.position[number, :count].numpy(),
             "speed": speed,
             "acceleration": np.append(float(at_start[number]), np.diff(speed) / pair.dt),
-            "gap": found.gap[number, :count].numpy(),
+            "gap": trajectory.gap[number, :count].numpy(),
         }
         parts.append(pd.DataFrame(columns))
     return pd.concat(parts, ignore_index=True)

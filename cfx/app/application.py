@@ -220,7 +220,7 @@ def _refuse(arguments: Sequence[str]) -> None:
 
 def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
     """Lets Hydra compose and call `job`; every way in which that ends becomes an exit code."""
-    overrides = [one for one in arguments if not one.startswith("-")]
+    overrides = [argument for argument in arguments if not argument.startswith("-")]
     application = hydra.main(
         config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
     )
@@ -331,7 +331,9 @@ def _interrupted(signalled: BaseException) -> int:
 def _preset_behind(status: JobStatus, values: Mapping[str, Any]) -> str:
     """Returns, to go after a message about a key, the preset that set it; "" if none did."""
     key = re.match(r"\w+(\.\w+)+", status.message)
-    if key is None or any(one.lstrip("+").startswith(f"{key[0]}=") for one in status.overrides):
+    if key is None or any(
+        override.lstrip("+").startswith(f"{key[0]}=") for override in status.overrides
+    ):
         return ""
     group = key[0].partition(".")[0]
     choice, node = HydraConfig.get().runtime.choices.get(group), values.get(group)

@@ -38,11 +38,11 @@ def answer(arguments: Sequence[str]) -> int:
         if more and f"{first}.{action}" in commands:
             print("\n".join(_words_of(f"{first}.{action}", behind)))
             return 0
-        found = _words_of(first, rest)
+        words = _words_of(first, rest)
         for name in commands:
             if not more and name.startswith(f"{first}.{action}"):
-                found.append(name.removeprefix(f"{first}."))
-        print("\n".join(found))
+                words.append(name.removeprefix(f"{first}."))
+        print("\n".join(words))
         return 0
     if not blank:
         own = [name for name in commands if name.startswith(first) and "." not in name]
@@ -69,7 +69,7 @@ def _words_of(command: str, line: str) -> list[str]:
 
     from cfx.core import registry
 
-    found: list[str] = []
+    words: list[str] = []
     before = line[: len(line) - len(line.rpartition(" ")[2])]
     with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
         try:
@@ -77,11 +77,11 @@ def _words_of(command: str, line: str) -> list[str]:
             finder = CompletionFinder(
                 parser, always_complete_options=False, default_completer=SuppressCompleter()
             )
-            while (whole := finder.rl_complete(line, len(found))) is not None:
-                found.append(whole.removeprefix(before).strip())
+            while (whole := finder.rl_complete(line, len(words))) is not None:
+                words.append(whole.removeprefix(before).strip())
         except Exception:  # a plugin may raise anything
             return []
-    return found
+    return words
 
 
 def complete_with(

@@ -104,11 +104,11 @@ class ComponentSearchPath(SearchPathPlugin):
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         # A file of such a name on the search path would replace Hydra's own.
-        in_code = {f"hydra/{one}.yaml" for one in ("config", "launcher/basic", "sweeper/basic")}
+        in_code = {f"hydra/{name}.yaml" for name in ("config", "launcher/basic", "sweeper/basic")}
         own = Path(hydra.__file__).parent / "conf"
         for package, folder in plugin_conf_dirs().items():
             names = {path.relative_to(folder).as_posix() for path in folder.rglob("*.yaml")}
-            replaced = [one for one in sorted(names) if one in in_code or (own / one).is_file()]
+            replaced = [name for name in sorted(names) if name in in_code or (own / name).is_file()]
             if replaced:
                 log.warning(
                     "The plugin %s brings %s, which would replace Hydra's own; its folder %s is"
@@ -128,15 +128,15 @@ def plugin_conf_dirs() -> dict[str, Path]:
     Runs no code of theirs.
     """
     packages = {entry.package for kind in registry.KINDS for entry in registry.entries(kind)}
-    found: dict[str, Path] = {}
+    folders: dict[str, Path] = {}
     for package in sorted(packages - {"cfx"}):
         with suppress(ImportError, ValueError):  # a broken distribution harms nobody else
             spec = importlib.util.find_spec(package)
             for location in (spec and spec.submodule_search_locations) or ():
                 folder = Path(location) / "conf"
                 if folder.is_dir():
-                    found.setdefault(package, folder)
-    return found
+                    folders.setdefault(package, folder)
+    return folders
 
 
 def register() -> None:

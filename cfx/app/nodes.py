@@ -89,14 +89,14 @@ def file_path(entry: registry.Entry) -> Path:
 
 def built_in() -> list[registry.Entry]:
     """Returns the entries of cfx itself that have a config node."""
-    found = []
+    nodes = []
     for kind, about in registry.KINDS.items():
         if not about.chosen:
             continue
         for entry in registry.entries(kind):
             if entry.distribution == OWN:
-                found.append(entry)
-    return found
+                nodes.append(entry)
+    return nodes
 
 
 def write_all() -> int:

@@ -143,13 +143,13 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     if isinstance(siblings, DictConfig):
         names = sorted(str(name) for name in siblings if name != "hydra")
         advice = nearest(last, names)
-        known = "Known keys"
+        heading = "Known keys"
         if parent:
             advice = advice.replace("'", f"'{parent}.", 1)
-            known = f"Known keys of {parent}"
+            heading = f"Known keys of {parent}"
         elsewhere = _options_with(parent, last, str(siblings.get("name", "")))
         return (
-            f"{given}: there is no key '{key}'.{elsewhere or advice} {known}: {', '.join(names)}."
+            f"{given}: there is no key '{key}'.{elsewhere or advice} {heading}: {', '.join(names)}."
         )
     everything: Any = OmegaConf.to_container(config, resolve=False)
     paths = _keys(everything)
@@ -160,15 +160,15 @@ def _options_with(group: str, setting: str, chosen: str) -> str:
     """Returns which other options of a group have a setting; "" if none has."""
     if group not in registry.GROUPS:
         return ""
-    kind, found = registry.GROUPS[group].name, []
+    kind, options = registry.GROUPS[group].name, []
     for name in registry.names(kind):
         with contextlib.suppress(CfxError):  # a plugin that cannot be imported has none
             component = registry.get(kind, name)
             if setting in component.schema.model_fields:
-                found.append(f"{group}={name}")
-    if not found:
+                options.append(f"{group}={name}")
+    if not options:
         return ""
-    return f" {group}={chosen} has none; choose {listed(found)} too."
+    return f" {group}={chosen} has none; choose {listed(options)} too."
 
 
 def _keys(values: Mapping[Any, Any], prefix: str = "") -> Iterator[str]:

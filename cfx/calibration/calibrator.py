@@ -187,7 +187,7 @@ class Calibrator:
         fitted = self
         if self.solver.chooses_prior:
             fitted = self._with_prior(self.prior_strength(pairs, batch, last).weight, self.progress)
-        found, apart = fitted.searched(pairs, batch, last)
+        parameters, apart = fitted.searched(pairs, batch, last)
         for pair, end, share in zip(pairs, last.tolist(), apart, strict=True):
             self._apart[pair.fingerprint, end] = share
         missed = [pair.pair_id for pair, share in zip(pairs, apart, strict=True) if share > APART]
@@ -202,7 +202,7 @@ class Calibrator:
                 named,
                 100 * APART,
             )
-        return found
+        return parameters
 
     def searched(
         self, pairs: PairSet, batch: PairBatch, last: Tensor, first: Tensor | None = None

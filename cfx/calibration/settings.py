@@ -135,10 +135,10 @@ def doubts(rows: pd.DataFrame) -> pd.Series:
         },
         rows.index,
     )
-    found = []
+    sentences = []
     for _, holds in reasons.iterrows():
-        found.append("; ".join(holds.index[holds.to_numpy(bool)]))
-    return pd.Series(found, rows.index, name="doubt", dtype=str)
+        sentences.append("; ".join(holds.index[holds.to_numpy(bool)]))
+    return pd.Series(sentences, rows.index, name="doubt", dtype=str)
 
 
 def are_reliable(rows: pd.DataFrame) -> pd.Series:

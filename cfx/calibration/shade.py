@@ -454,10 +454,10 @@ def _next_generation(
     # current-to-pbest/1: towards one of the best, and along the difference of two others.
     towards = draws.below(max(2, math.ceil(_BEST * size)), count, size)
     own = torch.arange(size, device=points.device)
-    one = (own + 1 + draws.below(size - 1, count, size)) % size
+    second = (own + 1 + draws.below(size - 1, count, size)) % size
     other = (own + 1 + draws.below(size + kept - 1, count, size)) % (size + kept)
     both = torch.cat([points, archive], dim=2)
-    moved = at(points, towards) - points + at(points, one) - at(both, other)
+    moved = at(points, towards) - points + at(points, second) - at(both, other)
     trial = points + f[..., None] * moved
     # Beyond a bound: half way to it.
     trial = torch.where(trial < 0.0, 0.5 * points, trial)

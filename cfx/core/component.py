@@ -74,10 +74,10 @@ def _kinds(annotation: Any) -> set[Any]:
     parts = get_args(annotation)
     if not parts:
         return {annotation}
-    found = set()
+    kinds = set()
     for part in parts:
-        found |= _kinds(part)
-    return found
+        kinds |= _kinds(part)
+    return kinds
 
 
 class Component(ABC):
@@ -218,10 +218,10 @@ def _sentence(
     problem = problems[0]
     path = ".".join(filter(None, [where, *location]))
     if problem["type"] == "extra_forbidden":
-        known = sorted(_fields_at(schema, location[:-1]))
-        text = f"{path}: unknown key.{nearest(location[-1], known)}"
-        if known:
-            text += f" Known keys: {', '.join(known)}."
+        keys = sorted(_fields_at(schema, location[:-1]))
+        text = f"{path}: unknown key.{nearest(location[-1], keys)}"
+        if keys:
+            text += f" Known keys: {', '.join(keys)}."
         return text
     if problem["type"] == "missing":
         return f"{path}: a value is required; give one as {path}=..."

@@ -79,11 +79,11 @@ _made: WeakKeyDictionary[Any, dict[object, Any]] = WeakKeyDictionary()
 
 def once(component: object, key: object, make: Callable[[], T]) -> T:
     """Returns what `make` gives, which is asked once for all checks of one component."""
-    known = _made.setdefault(component, {})
-    if key not in known:
-        known[key] = make()
-    found: T = known[key]
-    return found
+    made = _made.setdefault(component, {})
+    if key not in made:
+        made[key] = make()
+    value: T = made[key]
+    return value
 
 
 def expect_tensor(

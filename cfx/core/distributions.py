@@ -99,7 +99,7 @@ def _options_of_plugin(
     return options
 
 
-def advice(group: str, name: str, known: Sequence[str]) -> str:
+def advice(group: str, name: str, available: Sequence[str]) -> str:
     """Returns advice on a missing option: install it, or choose another.
 
     Args:
@@ -111,13 +111,13 @@ def advice(group: str, name: str, known: Sequence[str]) -> str:
     if (group, name) in options:
         wanted = options[group, name]
         return f" It comes with {wanted}: {install_line(wanted)}"
-    candidates = list(known)
+    candidates = list(available)
     for option_group, option in options:
         if option_group == group:
             candidates.append(option)
     text = nearest(name, candidates)
-    if known:
-        text += f" Known: {', '.join(known)}."
+    if available:
+        text += f" Known: {', '.join(available)}."
     return text
 
 
@@ -140,8 +140,8 @@ def install_line(wanted: str) -> str:
 
 def _pip() -> str:
     """Returns `pip`, or how to call this Python's where the shell has another."""
-    found = shutil.which("pip")
-    if found is not None and Path(found).parent == Path(sys.executable).parent:
+    program = shutil.which("pip")
+    if program is not None and Path(program).parent == Path(sys.executable).parent:
         return "pip"
     return f"{shlex.quote(_from_here(Path(sys.executable)))} -m pip"
 

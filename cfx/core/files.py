@@ -108,14 +108,14 @@ def remove_leftovers(folder: Path) -> None:
         OSError: one cannot be removed.
     """
     for path in sorted(folder.rglob(".*@*.*")):
-        found = _TEMPORARY.match(path.name)
-        if found is not None and path.is_file() and _is_left_over(path, found):
+        match = _TEMPORARY.match(path.name)
+        if match is not None and path.is_file() and _is_left_over(path, match):
             path.unlink(missing_ok=True)
 
 
-def _is_left_over(path: Path, found: re.Match[str]) -> bool:
-    if found["host"] == _host():
-        return not _runs(int(found["process"]))
+def _is_left_over(path: Path, match: re.Match[str]) -> bool:
+    if match["host"] == _host():
+        return not _runs(int(match["process"]))
     return time.time() - path.stat().st_mtime > _DAY_S
 
 

@@ -154,7 +154,10 @@ def _restorables() -> Iterator[_Restorable]:
     yield Path.cwd, _put_directory
     yield lambda: (sys.argv, sys.argv[:]), _put_arguments
     yield cores_limit, limit_cores
-    yield lambda: {one: signal.getsignal(one) for one in signal.valid_signals()}, _put_handlers
+    yield (
+        lambda: {number: signal.getsignal(number) for number in signal.valid_signals()},
+        _put_handlers,
+    )
     yield _logging, _put_logging
     torch = sys.modules.get("torch")
     if torch is not None:
@@ -265,14 +268,14 @@ def own_hydra() -> Iterator[None]:
 
     instances: dict[Any, Any] = Singleton._instances  # noqa: SLF001 - Hydra's own copy is a deep one
     shelved: dict[Any, Any] = {}
-    for one in (GlobalHydra, HydraConfig, VersionBase):
-        if one in instances:
-            shelved[one] = instances.pop(one)
+    for singleton in (GlobalHydra, HydraConfig, VersionBase):
+        if singleton in instances:
+            shelved[singleton] = instances.pop(singleton)
     try:
         yield
     finally:
-        for one in (GlobalHydra, HydraConfig, VersionBase):
-            instances.pop(one, None)
+        for singleton in (GlobalHydra, HydraConfig, VersionBase):
+            instances.pop(singleton, None)
         instances.update(shelved)
 
 

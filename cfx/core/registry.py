@@ -241,9 +241,9 @@ def kind_of(kind: str) -> Kind:
         PluginError: there is no such kind.
     """
     kinds = every_kind()
-    for found in kinds.values():
-        if kind in {found.name, found.group}:
-            return found
+    for candidate in kinds.values():
+        if kind in {candidate.name, candidate.group}:
+            return candidate
     raise PluginError(
         f"there is no kind of component '{kind}'.{nearest(kind, kinds)} Known: {', '.join(kinds)}."
     )
@@ -281,13 +281,15 @@ def entry(kind: str, name: str) -> Entry:
     call, what = about.call(name), about.name
     claims = _that_count(_of_name(kind, name))
     if not claims:
-        known = names(kind)
-        if not known and about.name in KINDS:
+        options = names(kind)
+        if not options and about.name in KINDS:
             raise PluginError(
                 f"{call}: no {what} is installed, not even cfx's own;"
                 " run make run, or pip install -e ."
             )
-        raise PluginError(f"{call}: there is no {what} '{name}'.{advice(about.group, name, known)}")
+        raise PluginError(
+            f"{call}: there is no {what} '{name}'.{advice(about.group, name, options)}"
+        )
     if len(claims) > 1:
         texts = []
         for claim in claims:
@@ -488,9 +490,13 @@ def _installed(
     return tuple(sorted(made, key=lambda one: (one.component.order, one.name)))
 
 
-def _warn_of_left_out(one: Entry | Installed[Any], reason: str) -> None:
+def _warn_of_left_out(component: Entry | Installed[Any], reason: str) -> None:
     log.warning(
-        "%s %s of the distribution %s is left out: %s", one.kind, one.name, one.distribution, reason
+        "%s %s of the distribution %s is left out: %s",
+        component.kind,
+        component.name,
+        component.distribution,
+        reason,
     )
 
 
@@ -638,7 +644,7 @@ def _announced(
     search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - the cache's key
 ) -> dict[str, tuple[Entry, ...]]:
     """Returns the entries of every entry-point group of cfx, sorted."""
-    found: dict[str, list[Entry]] = {}
+    entries_by_kind: dict[str, list[Entry]] = {}
     seen = set()
     for distribution in importlib.metadata.distributions():
         try:
@@ -648,10 +654,10 @@ def _announced(
         # The first of a name on the search path is the one that is imported.
         if announced and announced[0][1].distribution not in seen:
             seen.add(announced[0][1].distribution)
-            for group, one in announced:
-                found.setdefault(group, []).append(one)
+            for group, entry in announced:
+                entries_by_kind.setdefault(group, []).append(entry)
     by_group = {}
-    for group, announced_there in found.items():
+    for group, announced_there in entries_by_kind.items():
         by_group[group] = _sorted(announced_there)
     return by_group
 

@@ -96,7 +96,7 @@ def state(url: str) -> list[str]:
     """
     with _explained(f"data.path={url}"):
         system, path = _opened(url)
-        return [_version(system.info(one)) for one in sorted(system.glob(path))]
+        return [_version(system.info(file)) for file in sorted(system.glob(path))]
 
 
 class RemoteFolder:
@@ -149,8 +149,8 @@ class RemoteFolder:
         """
         with _os_errors():
             self._system.invalidate_cache()
-            found = self._system.find(self._path)
-        return sorted(str(name).removeprefix(self._path).strip("/") for name in found)
+            paths = self._system.find(self._path)
+        return sorted(str(name).removeprefix(self._path).strip("/") for name in paths)
 
     def remove(self, name: str) -> None:
         """Removes a file; nothing happens where there is none.

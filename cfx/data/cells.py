@@ -136,9 +136,9 @@ class Written:
         Raises:
             Unreadable: different cells have different ones.
         """
-        found = [mark for mark in _MARKS if self.has[mark].any()]
-        if len(found) < len(_MARKS):
-            return found[0] if found else None
+        marks = [mark for mark in _MARKS if self.has[mark].any()]
+        if len(marks) < len(_MARKS):
+            return marks[0] if marks else None
         usual, odd = sorted(_MARKS, key=lambda mark: -int(self.has[mark].sum()))
         row = int(np.flatnonzero(self.has[odd])[0])
         raise Unreadable(
@@ -399,9 +399,9 @@ def _seconds(column: Any) -> Floats:
     whole = pc.fill_null(counts, 0).to_numpy()
     # Whole seconds and the rest apart: nanoseconds since 1970 have more digits than a float.
     seconds, rest = np.divmod(whole, _PER_SECOND[kind.unit])
-    found: Floats = seconds + rest / _PER_SECOND[kind.unit]
-    found[is_empty] = np.nan
-    return found
+    total: Floats = seconds + rest / _PER_SECOND[kind.unit]
+    total[is_empty] = np.nan
+    return total
 
 
 def _seconds_of_intervals(column: Any) -> Floats:
@@ -472,8 +472,8 @@ def names_in(column: Any) -> NameColumn:
         # All of several ids are no multiples of 1000: the comma marks decimals.
         written = [None if name is None else name.partition(",")[0] for name in written]
     merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
-    known = np.append(merged, -1).astype(np.int64)
-    return NameColumn(known[codes], list(names))
+    with_missing = np.append(merged, -1).astype(np.int64)
+    return NameColumn(with_missing[codes], list(names))
 
 
 def _encoded(column: Any) -> tuple[Ints, list[Any]]:

@@ -172,11 +172,13 @@ def _site_cells(pairs: Sequence[Pair]) -> Iterator[str]:
     yield f"{len(driver_names(pairs)):,}"
     yield f"{seconds / 60:,.0f}"
     speed = over_frames(pairs, "follower_speed")
-    known = _with_length(pairs)
+    with_length = _with_length(pairs)
     headway, at_speed = np.zeros(0), np.zeros(0)
-    if known:
-        headway = over_frames(known, "leader_position") - over_frames(known, "follower_position")
-        at_speed = over_frames(known, "follower_speed")
+    if with_length:
+        headway = over_frames(with_length, "leader_position") - over_frames(
+            with_length, "follower_position"
+        )
+        at_speed = over_frames(with_length, "follower_speed")
     moving = at_speed >= STANDING_MPS
     for values in (speed, headway[moving] / at_speed[moving], over_frames(pairs, "gap")):
         if not len(values):
@@ -563,17 +565,19 @@ def _quantities(pairs: PairSet) -> Iterator[tuple[str, Floats]]:
     yield "follower speed, m/s", speed
     yield "follower acceleration, m/s2", over_frames(pairs, "follower_acceleration")
     yield "gap (bumper to bumper), m", gap
-    known = _with_length(pairs)
-    if not known:
+    with_length = _with_length(pairs)
+    if not with_length:
         moving = speed >= STANDING_MPS
         yield f"time gap (above {STANDING_MPS:g} m/s), s", gap[moving] / speed[moving]
         return
-    speed = over_frames(known, "follower_speed")
-    headway = over_frames(known, "leader_position") - over_frames(known, "follower_position")
+    speed = over_frames(with_length, "follower_speed")
+    headway = over_frames(with_length, "leader_position") - over_frames(
+        with_length, "follower_position"
+    )
     moving = speed >= STANDING_MPS
     yield "space headway (front to front), m", headway
     yield f"time headway (above {STANDING_MPS:g} m/s), s", headway[moving] / speed[moving]
-    yield "leader length, m", np.array(of_each(known, "leader_length"))
+    yield "leader length, m", np.array(of_each(with_length, "leader_length"))
 
 
 def _counts(counts: Sequence[Dropped]) -> list[str]:

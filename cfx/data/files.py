@@ -355,20 +355,20 @@ def parquet_source(path: Path) -> Path | io.BytesIO:
 def _refuse(path: Path, head: bytes) -> None:
     """Raises DataError for a file that holds no table, by what it begins with, unpacked."""
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip()
-    found = None
+    reason = None
     for magic, kind in _KINDS.items():
         if head.startswith(magic) or (magic.isascii() and text.startswith(magic)):
-            found = kind
+            reason = kind
             break
     if head[_TAR_AT:].startswith(_TAR):
-        found = "a tar archive", _UNPACK
+        reason = "a tar archive", _UNPACK
     if _PICKLES.match(head):
-        found = "a pickle, which runs whatever code it holds when it is read", _AS_TABLE
+        reason = "a pickle, which runs whatever code it holds when it is read", _AS_TABLE
     packing = next((name for magic, name in _PACKINGS.items() if head.startswith(magic)), "")
     if packing:
-        found = f"packed more than once ({packing} inside)", _UNPACK
-    if found is not None:
-        what, remedy = found
+        reason = f"packed more than once ({packing} inside)", _UNPACK
+    if reason is not None:
+        what, remedy = reason
         raise DataError(f"{path}: is {what}; {remedy}")
 
 
@@ -473,9 +473,9 @@ def of_recording(files: Sequence[Path], recording: str | None) -> list[Path]:
         if name is None or name == recording:
             chosen.append(file)
     if not chosen:
-        known = sorted(recordings)
+        names = sorted(recordings)
         raise DataError(
-            f"data.recording={recording}: there is no such recording.{nearest(recording, known)}"
-            f" Known: {listed(known)}."
+            f"data.recording={recording}: there is no such recording.{nearest(recording, names)}"
+            f" Known: {listed(names)}."
         )
     return chosen

@@ -160,11 +160,11 @@ def _as_arrow(source: Any) -> Any:
         return pa.Table.from_struct_array(source)
     if isinstance(source, pa.Table):
         return source
-    known = narwhals.from_native(source, pass_through=True)
-    if isinstance(known, narwhals.LazyFrame):
-        known = known.collect()
-    if isinstance(known, narwhals.DataFrame):
-        return known.to_arrow()
+    frame = narwhals.from_native(source, pass_through=True)
+    if isinstance(frame, narwhals.LazyFrame):
+        frame = frame.collect()
+    if isinstance(frame, narwhals.DataFrame):
+        return frame.to_arrow()
     if hasattr(source, "__arrow_c_stream__") or hasattr(source, "__arrow_c_array__"):
         return pa.table(source)
     if hasattr(source, "to_table"):  # pyarrow's datasets and scanners
@@ -181,10 +181,10 @@ def _of_several(sources: Iterable[Any]) -> Frame | None:
     sources = list(sources)
     if not sources:
         return None
-    rows = [isinstance(one, Mapping) and _is_row(one) for one in sources]
+    rows = [isinstance(source, Mapping) and _is_row(source) for source in sources]
     if all(rows):
         return _of_pandas(pd.DataFrame(sources))
-    frames = [frame_of_source(one) for one in sources]
+    frames = [frame_of_source(source) for source in sources]
     tables = [frame for frame in frames if frame is not None]
     if not tables:
         return None

@@ -51,9 +51,9 @@ RECORDINGS = (
 @cache
 def known_recording(recording: str) -> KnownRecording | None:
     """Returns the public recording of a name; None: it is none."""
-    for known in RECORDINGS:
-        if recording.lower().startswith(known.prefix):
-            return known
+    for recording_of_site in RECORDINGS:
+        if recording.lower().startswith(recording_of_site.prefix):
+            return recording_of_site
     return None
 
 
@@ -86,23 +86,23 @@ def with_known_types(pairs: PairSet) -> PairSet:
 
 
 def _at_known_site(pair: Pair) -> Pair:
-    known = known_recording(pair.recording)
-    if known is None:
+    recording = known_recording(pair.recording)
+    if recording is None:
         return pair
     vehicle = pair.vehicle
-    if not vehicle and known.vehicle:
-        match = re.search(known.vehicle, pair.follower_id)
+    if not vehicle and recording.vehicle:
+        match = re.search(recording.vehicle, pair.follower_id)
         if match is not None:
             vehicle = match[1]
-    return replace(pair, site=known.site, vehicle=vehicle)
+    return replace(pair, site=recording.site, vehicle=vehicle)
 
 
 def _of_known_type(pair: Pair) -> Pair:
-    known = known_recording(pair.recording)
-    if known is None or not known.driver_type:
+    recording = known_recording(pair.recording)
+    if recording is None or not recording.driver_type:
         return pair
     return replace(
         pair,
-        driver_type=pair.driver_type or known.driver_type,
-        leader_driver_type=pair.leader_driver_type or known.driver_type,
+        driver_type=pair.driver_type or recording.driver_type,
+        leader_driver_type=pair.leader_driver_type or recording.driver_type,
     )

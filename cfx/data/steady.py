@@ -148,16 +148,16 @@ def relation_of(
     shares = 1.0 / np.bincount(driver)[driver] if weight is None else weight
     rows: list[tuple[float, ...]] = []
     for place in range(speeds.shape[1]):
-        known = np.isfinite(speeds[:, place])
-        listed = len(np.unique(driver[known]))
+        measured = np.isfinite(speeds[:, place])
+        listed = len(np.unique(driver[measured]))
         if listed < max(1, least):
             continue
-        mean_speed = float(np.average(speeds[known, place], weights=shares[known]))
-        headway = (gaps[known, place] + VEHICLE_M) / speeds[known, place]
+        mean_speed = float(np.average(speeds[measured, place], weights=shares[measured]))
+        headway = (gaps[measured, place] + VEHICLE_M) / speeds[measured, place]
         quartiles = np.quantile(
-            headway, (0.25, 0.5, 0.75), method="inverted_cdf", weights=shares[known]
+            headway, (0.25, 0.5, 0.75), method="inverted_cdf", weights=shares[measured]
         )
-        mean = float(np.average(headway, weights=shares[known]))
+        mean = float(np.average(headway, weights=shares[measured]))
         gaps_there = np.array([mean, *quartiles]) * mean_speed - VEHICLE_M
         rows.append((mean_speed, *gaps_there.tolist(), listed))
     speed, gap, low, median, high, count = np.array(rows, dtype=np.float64).reshape(-1, 6).T

@@ -269,7 +269,7 @@ def outside_of_scopes(
         agent: what drove as `policy`.
         scopes: by scope and method the closed loops.
     """
-    found = {}
+    by_scope = {}
     for scope, loops in scopes.items():
         loop = loops.get("policy")
         if loop is None or loop.outside is None or loop.beyond is None:
@@ -279,8 +279,8 @@ def outside_of_scopes(
             outside = int((loop.outside & loop.counted).sum())
             words = share_in_words(agent.valid_range, outside, steps, loop.beyond)
             if words:
-                found[scope] = words
-    return found
+                by_scope[scope] = words
+    return by_scope
 
 
 PAIRS_AT_ONCE = 1024

@@ -246,13 +246,13 @@ def _scopes(
     scopes = {}
     begins = {"test": (test, first), "full_trajectory": (full_trajectory, torch.zeros_like(first))}
     for scope, (loops, begin) in begins.items():
-        found = {}
+        by_name = {}
         for method, loop in loops.items():
-            found[method] = beside_recording(batch, begin, loop, spaces[method])
-        if not found:
+            by_name[method] = beside_recording(batch, begin, loop, spaces[method])
+        if not by_name:
             continue
-        of_any = next(iter(found.values()))
-        found[RECORDED] = replace(
+        of_any = next(iter(by_name.values()))
+        by_name[RECORDED] = replace(
             of_any,
             speed=of_any.measured_speed,
             gap=of_any.measured_gap,
@@ -260,19 +260,24 @@ def _scopes(
             at_limits=None,
             outside=None,
         )
-        scopes[scope] = found
+        scopes[scope] = by_name
         if scope == "test":
-            scopes["steady"] = _after_transient(found)
+            scopes["steady"] = _after_transient(by_name)
     return scopes
 
 
 def _after_transient(trajectories: Mapping[str, Trajectories]) -> dict[str, Trajectories]:
     """Returns the same trajectories, of which only the frames after the transient count."""
-    found = {}
-    for method, one in trajectories.items():
-        time = torch.arange(one.counted.shape[1], device=one.counted.device) * one.dt
-        found[method] = replace(one, counted=one.counted & (time > TRANSIENT_S + 1e-6))
-    return found
+    steady = {}
+    for method, trajectory in trajectories.items():
+        time = (
+            torch.arange(trajectory.counted.shape[1], device=trajectory.counted.device)
+            * trajectory.dt
+        )
+        steady[method] = replace(
+            trajectory, counted=trajectory.counted & (time > TRANSIENT_S + 1e-6)
+        )
+    return steady
 
 
 class _Measures:
@@ -297,20 +302,20 @@ class _Measures:
     def add(self, scopes: Mapping[str, Mapping[str, Trajectories]]) -> None:
         """Computes every metric for every scope and method of further pairs."""
         self._scopes = scopes.keys()
-        for one in list(self._metrics):
+        for metric in list(self._metrics):
             try:
-                values = _values(one, scopes)
+                values = _values(metric, scopes)
             # A plugin may raise anything, and must not cost the job its results.
             except Exception as error:
-                if one.distribution == OWN or one.name == self._judge:
+                if metric.distribution == OWN or metric.name == self._judge:
                     raise
                 reason = in_words(error)
-                self._left_out.append(leave_out(one.name, one.distribution, reason))
-                self._metrics.remove(one)
+                self._left_out.append(leave_out(metric.name, metric.distribution, reason))
+                self._metrics.remove(metric)
                 continue
-            of_metric = self._values.setdefault(one.name, {})
-            for key, found in values.items():
-                of_metric.setdefault(key, []).append(found)
+            of_metric = self._values.setdefault(metric.name, {})
+            for key, column in values.items():
+                of_metric.setdefault(key, []).append(column)
         test = scopes["test"]
         self.frames.append(next(iter(test.values())).counted.sum(1).cpu().numpy())
         for method, trajectories in test.items():
@@ -320,29 +325,29 @@ class _Measures:
     def found(self) -> tuple[Measured, tuple[MetricInfo, ...], tuple[LeftOut, ...]]:
         """Returns what was measured of all pairs, of which metrics, and what was left out."""
         measured: Measured = {}
-        for one in self._metrics:
-            for key, parts in self._values[one.name].items():
+        for metric in self._metrics:
+            for key, parts in self._values[metric.name].items():
                 measured[key] = np.concatenate(parts)
         infos = []
-        for one in self._metrics:
-            infos.append(one.info(self._scopes, judges=one.name == self._judge))
+        for metric in self._metrics:
+            infos.append(metric.info(self._scopes, judges=metric.name == self._judge))
         return measured, tuple(infos), tuple(self._left_out)
 
 
 @torch.no_grad()
-def _values(one: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]]) -> Measured:
-    found: Measured = {}
+def _values(metric: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]]) -> Measured:
+    measured: Measured = {}
     for scope, by_method in scopes.items():
         for method, trajectories in by_method.items():
-            if method == RECORDED and (scope != "test" or not one.metric.is_of_recording):
+            if method == RECORDED and (scope != "test" or not metric.metric.is_of_recording):
                 continue
-            values = one.metric.compute(trajectories)
+            values = metric.metric.compute(trajectories)
             if values.shape != (len(trajectories),):
                 raise ValueError(f"compute gives the shape {tuple(values.shape)}, not (pairs,)")
             # Where no frame counts nothing is defined, a count of zero neither.
             some = trajectories.counted.any(1)
-            found[one.name, scope, method] = array(torch.where(some, values, torch.nan))
-    return found
+            measured[metric.name, scope, method] = array(torch.where(some, values, torch.nan))
+    return measured
 
 
 def _improvements(

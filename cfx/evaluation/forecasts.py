@@ -164,14 +164,14 @@ def sample_from_origins(
             state = _observed(agent, followers, shard)
         part = _with_future(batch[shard.pair], shard.frame, steps, leader)
         own = None if base is None else base[shard.pair]
-        known = Followers(part, followers.network[shard.pair], own, followers.history)
+        followers_here = Followers(part, followers.network[shard.pair], own, followers.history)
         index = shard.frame[:, None] + torch.arange(steps + 1, device=shard.frame.device)
         index = index.clamp(max=part.mask.shape[1] - 1)
         leader_position = part.leader_position.gather(1, index)
         speed, moved = [], []
         for generator in generators:
             loop = simulate_closed_loop(
-                stepper, agent, known, shard.frame, state=state, generator=generator
+                stepper, agent, followers_here, shard.frame, state=state, generator=generator
             )
             position = leader_position - loop.gap
             speed.append(loop.speed)
@@ -240,7 +240,7 @@ def _with_future(batch: PairBatch, origin: Tensor, steps: int, leader: LeaderFut
     step = after.clamp(min=0, max=steps)
     position = batch.leader_position[rows, origin][:, None] + ahead.travelled.gather(1, step)
     speeds = ahead.speed.gather(1, step)
-    known = after <= 0
+    measured = after <= 0
     surroundings = {}
     for signal, values in batch.surroundings.items():
         # As for the leader, nothing is known of the future: what is ahead goes on as the leader is
@@ -250,14 +250,14 @@ def _with_future(batch: PairBatch, origin: Tensor, steps: int, leader: LeaderFut
             expected = expected + ahead.travelled.gather(1, step)
         elif signal.quantity == "acceleration":
             expected = torch.zeros_like(values)
-        surroundings[signal] = torch.where(known, values, expected)
+        surroundings[signal] = torch.where(measured, values, expected)
     return replace(
         lasting,
         surroundings=surroundings,
-        leader_position=torch.where(known, batch.leader_position, position),
-        leader_speed=torch.where(known, batch.leader_speed, speeds),
+        leader_position=torch.where(measured, batch.leader_position, position),
+        leader_speed=torch.where(measured, batch.leader_speed, speeds),
         leader_acceleration=torch.where(
-            known, batch.leader_acceleration, while_moving(speeds, acceleration)
+            measured, batch.leader_acceleration, while_moving(speeds, acceleration)
         ),
     )
 

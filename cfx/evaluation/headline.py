@@ -235,8 +235,8 @@ def _improvement(
     text += f" over {_CONSTANT[compared.baseline]}"
     if compared.scope != "test":
         text += " on full trajectories"
-    known = {}
+    estimates = {}
     for name in ("geometric", "ratio_of_means", "drivers"):
         if f"{compared.key}/{name}" in metrics:
-            known[name] = metrics[f"{compared.key}/{name}"]
-    return ", ".join([text, *doubts(known)])
+            estimates[name] = metrics[f"{compared.key}/{name}"]
+    return ", ".join([text, *doubts(estimates)])

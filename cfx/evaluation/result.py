@@ -126,9 +126,9 @@ class Platoon:
         """
         values: dict[str, float] = {}
         for column, summary in _PLATOON_SUMMARIES.items():
-            found = self.measures.groupby("method")[column].agg(summary)
+            aggregated = self.measures.groupby("method")[column].agg(summary)
             for method in self.methods:
-                values[f"platoon/{column}/{method}"] = float(found[method])
+                values[f"platoon/{column}/{method}"] = float(aggregated[method])
         return values
 
 

@@ -62,8 +62,8 @@ def long_table(
     columns: dict[str, Any] = {}
     for name, categories in names.items():
         columns[name] = _categories(np.concatenate(codes.pop(name)), categories)
-    of_pair, known = pd.factorize(np.asarray(drivers, dtype=object))
-    columns["driver"] = _categories(of_pair[columns["pair_id"].codes], list(known))
+    of_pair, driver_names = pd.factorize(np.asarray(drivers, dtype=object))
+    columns["driver"] = _categories(of_pair[columns["pair_id"].codes], list(driver_names))
     columns["value"] = np.concatenate(value)
     return pd.DataFrame({name: columns[name] for name in VALUE_COLUMNS})
 
@@ -146,7 +146,7 @@ def summaries(
 
     Pairs whose value is not defined do not count.
     """
-    found = {}
+    by_key = {}
     for metric in metrics:
         rows = values[(values["metric"] == metric.name) & (values["scope"] == scope)]
         if scope not in metric.scopes or rows.empty:
@@ -159,11 +159,11 @@ def summaries(
             summary = by_method.agg(metric.summary)
         for method in methods:
             if method in summary:
-                found[key_of(metric.name, method, scope)] = float(summary[method])
+                by_key[key_of(metric.name, method, scope)] = float(summary[method])
         recorded = rows.loc[is_recorded, "value"]
         if len(recorded):
-            found[key_of(metric.name, RECORDED, scope)] = summarize(recorded, metric.summary)
-    return found
+            by_key[key_of(metric.name, RECORDED, scope)] = summarize(recorded, metric.summary)
+    return by_key
 
 
 def summarize(values: pd.Series, summary: str) -> float:
@@ -182,10 +182,10 @@ def at_places(wide: pd.DataFrame, places: pd.DataFrame) -> pd.Series:
     """
     row = wide.index.get_indexer(pd.Index(places["pair_id"]))
     column = wide.columns.get_indexer(pd.Index(places["method"]))
-    found = np.full(len(places), np.nan)
-    known = (row >= 0) & (column >= 0)
-    found[known] = wide.to_numpy(np.float64)[row[known], column[known]]
-    return pd.Series(found, index=places.index)
+    values_there = np.full(len(places), np.nan)
+    present = (row >= 0) & (column >= 0)
+    values_there[present] = wide.to_numpy(np.float64)[row[present], column[present]]
+    return pd.Series(values_there, index=places.index)
 
 
 def _whole_numbers(column: pd.Series) -> pd.Series:

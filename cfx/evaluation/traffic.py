@@ -536,17 +536,17 @@ def _sugiyama(agent: Agent, model: DrivingModel, seed: int) -> _Sugiyama:
 def table_of(measures: Sequence[Measure]) -> list[dict[str, object]]:
     """Returns a row for each measure, for a table."""
     rows: list[dict[str, object]] = []
-    for one in measures:
+    for measure in measures:
         rows.append(
             {
-                "measure": one.name,
-                "meaning": one.title,
-                "unit": one.unit,
-                "step_s": one.step,
-                "value": one.value,
-                "usual_low": one.low,
-                "usual_high": one.high,
-                "outside": one.word,
+                "measure": measure.name,
+                "meaning": measure.title,
+                "unit": measure.unit,
+                "step_s": measure.step,
+                "value": measure.value,
+                "usual_low": measure.low,
+                "usual_high": measure.high,
+                "outside": measure.word,
             }
         )
     return rows

@@ -193,4 +193,4 @@ def unit_label(name: str, unit: str) -> str:
 def pretty_unit(unit: str) -> str:
     """Returns a unit with raised digits: "m/s2" -> "m/s²"."""
     unit = unit.replace("1e-4", "10⁻⁴")
-    return re.sub(r"(?<=[ms])[234]", lambda found: "²³⁴"["234".index(found[0])], unit)
+    return re.sub(r"(?<=[ms])[234]", lambda match: "²³⁴"["234".index(match[0])], unit)

@@ -136,7 +136,9 @@ class Combined(Composed):
     reference = "the weighted mean of two models"
 
     def __init__(self, first: DrivingModel, second: DrivingModel) -> None:
-        renamed = tuple(replace(one, name=f"{PREFIX}{one.name}") for one in second.space)
+        renamed = tuple(
+            replace(parameter, name=f"{PREFIX}{parameter.name}") for parameter in second.space
+        )
         super().__init__(first, (*renamed, WEIGHT), second.memory_size)
         self.second = second
 

@@ -48,9 +48,9 @@ class DriverPopulation(NamedTuple):
         rows = features.isfinite().all(1).nonzero().flatten()
         if not len(rows):
             return None
-        known = [drivers[row] for row in rows.tolist()]
-        number_of = {name: number for number, name in enumerate(dict.fromkeys(known))}
-        number = torch.tensor([number_of[name] for name in known])
+        drivers_of_rows = [drivers[row] for row in rows.tolist()]
+        number_of = {name: number for number, name in enumerate(dict.fromkeys(drivers_of_rows))}
+        number = torch.tensor([number_of[name] for name in drivers_of_rows])
         weight = 1.0 / torch.bincount(number)[number].double()
         return cls(features[rows], weight / weight.sum())
 

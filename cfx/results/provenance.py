@@ -53,9 +53,9 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 def plugin_tags(distributions: Mapping[str, str]) -> dict[str, str]:
     """Returns a tag per plugin distribution, and one of them all, by which runs can be grouped."""
-    found = dict(sorted(distributions.items()))
-    listed = ", ".join(f"{name} {version}" for name, version in found.items())
-    tags = {f"cfx.plugin.{name}": version for name, version in found.items()}
+    versions = dict(sorted(distributions.items()))
+    listed = ", ".join(f"{name} {version}" for name, version in versions.items())
+    tags = {f"cfx.plugin.{name}": version for name, version in versions.items()}
     return {"cfx.plugins": listed or "none", **tags}
 
 
@@ -68,19 +68,19 @@ def distributions(values: Mapping[str, Any]) -> dict[str, str]:
     from cfx.core import registry
     from cfx.core.distributions import OWN
 
-    found = {}
+    versions = {}
     for kind in registry.KINDS.values():
         node = values.get(kind.group)
         if isinstance(node, Mapping) and "name" in node:
             entry = registry.entry(kind.name, str(node["name"]))
             if entry.distribution != OWN:
-                found[entry.distribution] = entry.version
+                versions[entry.distribution] = entry.version
     calibration = values.get("calibration")
     posterior = calibration.get("posterior") if isinstance(calibration, Mapping) else None
     if posterior not in {None, "none"}:
         entry = registry.entry("posterior", str(posterior))
-        found[entry.distribution] = entry.version
-    return found
+        versions[entry.distribution] = entry.version
+    return versions
 
 
 def named_distributions(values: Mapping[str, Any]) -> dict[str, str]:
@@ -100,7 +100,7 @@ def named_distributions(values: Mapping[str, Any]) -> dict[str, str]:
             entries += registry.entries(kind)
         elif not isinstance(named, str):
             entries += [registry.entry(kind, name) for name in named if name != ALL_OWN]
-    return {one.distribution: one.version for one in entries if one.distribution != OWN}
+    return {entry.distribution: entry.version for entry in entries if entry.distribution != OWN}
 
 
 def process_tags() -> dict[str, str]:

@@ -277,8 +277,8 @@ class Result:
         if "method" not in self.pairs:
             return ()
         present = self.pairs["method"].astype(str).unique().tolist()
-        known = [method for method in METHODS if method in present]
-        return (*known, *(method for method in present if method not in METHODS))
+        ordered = [method for method in METHODS if method in present]
+        return (*ordered, *(method for method in present if method not in METHODS))
 
     @property
     def shown_methods(self) -> tuple[str, ...]:
@@ -613,7 +613,7 @@ _METRIC = TypeAdapter(MetricInfo)
 def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tuple[MetricInfo, ...]:
     """Returns the metrics of `data.json`, each with the scopes that `metrics.json` has some of."""
     declared = data.get("metrics")
-    known = []
+    infos = []
     for values in declared if isinstance(declared, list) else []:
         with suppress(ValidationError):  # what is no metric is none
             metric = _METRIC.validate_python(values)
@@ -623,8 +623,8 @@ def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tupl
                 if any(key.startswith(prefix) for key in metrics):
                     scopes.append(scope)
             if scopes and metric.summary in SUMMARIES:
-                known.append(replace(metric, scopes=tuple(scopes)))
-    return tuple(known)
+                infos.append(replace(metric, scopes=tuple(scopes)))
+    return tuple(infos)
 
 
 def judge_of(data: Mapping[str, Any], metrics: Mapping[str, float]) -> MetricInfo:
@@ -672,7 +672,7 @@ def _write_figures(folder: Path, result: Result, config: JobConfig) -> list[Path
     figures = []
     for figure in registry.chosen("figure", config.figures, distributions(config.model_dump())):
         is_named = config.figures == "all" or figure.name in config.figures
-        if is_named or figure.attempt(lambda one: one.is_usual(result), False):
+        if is_named or figure.attempt(lambda drawn: drawn.is_usual(result), False):
             figures.append(figure)
     paths = write_figures(folder, result, figures, formats=config.figure_formats)
     drawn_names = {figure.name for figure in figures}

@@ -298,7 +298,9 @@ class KnownParameters:
         fits = evaluation.tables.get("fits")
         if fits is None or "noise_scale" not in fits:
             return None
-        tuned = tuple(one for one in evaluation.parameters if f"median_{one.name}" in fits)
+        tuned = tuple(
+            parameter for parameter in evaluation.parameters if f"median_{parameter.name}" in fits
+        )
         evidence = noise_evidence(evaluation.tables)
         return cls(fits[fits["method"] == "driver_specific"], tuned, evidence)
 
@@ -318,17 +320,18 @@ class KnownParameters:
         pairs, `posterior/held` is the mean over pairs, `posterior/noise_left`,
         `posterior/effective_samples` and `posterior/expected_coverage` (`sbi`) are medians.
         """
-        found = {}
-        for one in self.parameters:
-            found[f"posterior/determined/{one.name}"] = self.determined(one.name) / len(self.rows)
-        found["posterior/reliable"] = float(self.reliable.mean())
+        values = {}
+        for parameter in self.parameters:
+            share = self.determined(parameter.name) / len(self.rows)
+            values[f"posterior/determined/{parameter.name}"] = share
+        values["posterior/reliable"] = float(self.reliable.mean())
         for name in ("noise_left", "effective_samples", "expected_coverage"):
             if name in self.rows:
-                found[f"posterior/{name}"] = float(self.rows[name].median())
+                values[f"posterior/{name}"] = float(self.rows[name].median())
         if self.checked:
-            found["posterior/held"] = float(self.rows["held"].mean())
-            found["posterior/contradicted"] = float(are_contradicted(self.rows).mean())
-        return found
+            values["posterior/held"] = float(self.rows["held"].mean())
+            values["posterior/contradicted"] = float(are_contradicted(self.rows).mean())
+        return values
 
     @property
     def checked(self) -> bool:
@@ -347,17 +350,18 @@ class KnownParameters:
         table.add_column("interval", justify="right")
         table.add_column("determined for", justify="right")
         open_ones = []
-        for one in self.parameters:
+        for parameter in self.parameters:
             ends = (
-                float(self.rows[f"{end}_{one.name}"].median()) for end in ("median", "low", "high")
+                float(self.rows[f"{end}_{parameter.name}"].median())
+                for end in ("median", "low", "high")
             )
             middle, low, high = ends
-            unit = "" if one.unit == "1" else f" {one.unit}"
+            unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             interval = f"{middle:.3g}{unit} ({low:.3g} to {high:.3g})"
-            determined = self.determined(one.name)
-            table.add_row(one.name, interval, f"{determined} of {pairs}")
+            determined = self.determined(parameter.name)
+            table.add_row(parameter.name, interval, f"{determined} of {pairs}")
             if determined < self.reliable.sum():
-                open_ones.append(f"{one.name} for {self.reliable.sum() - determined}")
+                open_ones.append(f"{parameter.name} for {self.reliable.sum() - determined}")
         sentences = self._doubts()
         if open_ones:
             sentences.append(
@@ -520,14 +524,14 @@ class Fits(ResultTable):
     )
 
     def metrics(self, evaluation: Evaluation) -> dict[str, float]:
-        known = KnownParameters.of(evaluation)
-        return {} if known is None else known.metrics()
+        parameters = KnownParameters.of(evaluation)
+        return {} if parameters is None else parameters.metrics()
 
     def console(
         self, evaluation: Evaluation, metrics: Mapping[str, float]
     ) -> Iterable[RenderableType]:
-        known = KnownParameters.of(evaluation)
-        return [] if known is None else known.printed()
+        parameters = KnownParameters.of(evaluation)
+        return [] if parameters is None else parameters.printed()
 
 
 def history_metrics(history: pd.DataFrame) -> dict[str, float]:
@@ -539,8 +543,8 @@ def history_metrics(history: pd.DataFrame) -> dict[str, float]:
     for (base, amount), rows in history.groupby(["base", "amount"]):
         name = str(amount).replace(" ", "").replace("%", "pct")
         ratios = 1.0 - rows["improvement"].to_numpy(float)
-        found = improvement_statistics(np.ones_like(ratios), ratios, rows["driver"].tolist())
-        values[f"history/{base}/{name}/improvement"] = found.geometric
+        improvement = improvement_statistics(np.ones_like(ratios), ratios, rows["driver"].tolist())
+        values[f"history/{base}/{name}/improvement"] = improvement.geometric
     return values
 
 
@@ -596,11 +600,11 @@ def _sites_printed(rows: pd.DataFrame, scope: str, judge: MetricInfo) -> Table:
     table = Table(title=f"By site, {scope}: {judge.title}; improvement, %", title_justify="left")
     table.add_column("site")
     table.add_column("drivers", justify="right")
-    known = set(rows.dropna(axis=1, how="all"))
-    methods = [one for one in METHODS if f"{judge.name}_{one}" in known and one != "shrunk"]
+    measured = set(rows.dropna(axis=1, how="all"))
+    methods = [one for one in METHODS if f"{judge.name}_{one}" in measured and one != "shrunk"]
     for method in methods:
         table.add_column(short_label(method), justify="right")
-    baselines = [one for one in BASELINES if f"over_{one}" in known]
+    baselines = [one for one in BASELINES if f"over_{one}" in measured]
     for baseline in baselines:
         table.add_column(f"over {short_label(baseline)}", justify="right")
     for _, row in rows.iterrows():

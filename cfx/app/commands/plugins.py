@@ -208,7 +208,7 @@ def _values(field: FieldInfo) -> str:
     kind: Any = field.annotation
     parts = [_type(kind)]
     if type(None) in get_args(kind):
-        parts = [" or ".join(_type(one) for one in get_args(kind))]
+        parts = [" or ".join(_type(part) for part in get_args(kind))]
     for rule in field.metadata:
         for key, sign in {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}.items():
             if hasattr(rule, key):

@@ -100,8 +100,8 @@ def calibration_tables(
             parameters = _parameters(evaluation, method, ids, batch.leader_length)
             of_method = evaluation.table[evaluation.table["method"] == method]
             rows = of_method[["pair_id", "driver"]].reset_index(drop=True).assign(method=method)
-            found = training_errors(context.calibrator, batch, last, parameters)
-            for name, values in found.items():
+            errors = training_errors(context.calibrator, batch, last, parameters)
+            for name, values in errors.items():
                 rows[f"train_{name}"] = values.cpu().numpy()
                 if context.split < 1:  # else nothing was tested
                     rows[f"test_{name}"] = of_method[name].to_numpy(dtype=np.float64)
@@ -112,11 +112,11 @@ def calibration_tables(
             if method == "driver_specific" and settings.posterior != "none":
                 solver = context.calibrator.solver
                 method_of = posterior_method(settings.posterior)
-                known = method_of.find(solver, batch, last, parameters, settings)
-                intervals = pd.DataFrame(known.columns(), index=ids)
+                posteriors = method_of.find(solver, batch, last, parameters, settings)
+                intervals = pd.DataFrame(posteriors.columns(), index=ids)
                 intervals["doubt"] = doubts(intervals)
                 rows = rows.join(intervals, on="pair_id")
-                tables = known.tables(ids)
+                tables = posteriors.tables(ids)
             fits.append(rows)
     if not elsewhere:
         best = _parameters(evaluation, "driver_specific", ids, batch.leader_length)
@@ -233,10 +233,10 @@ def choose_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     device = torch.device(name)
-    found = torch.cuda.device_count()
-    if device.type == "cuda" and (device.index or 0) >= found:
+    gpus = torch.cuda.device_count()
+    if device.type == "cuda" and (device.index or 0) >= gpus:
         raise ConfigError(
-            f"device={name}: PyTorch finds {found} CUDA devices here;"
+            f"device={name}: PyTorch finds {gpus} CUDA devices here;"
             " write device=cpu or device=auto"
         )
     return device

@@ -89,7 +89,7 @@ class Sweep:
         with contextlib.suppress(OmegaConfBaseException, ValueError), resolving(copied):
             tracking = OmegaConf.to_container(config.tracking, resolve=True)
         given: Any = OmegaConf.to_container(config.hydra.overrides.hydra, resolve=False)
-        overrides = [one for one in given if not one.startswith("hydra.sweep.dir=")]
+        overrides = [override for override in given if not override.startswith("hydra.sweep.dir=")]
         escaped = str(folder).replace("'", "\\'")
         with read_write(config.hydra), open_dict(config.hydra):
             config.hydra.sweep.dir = str(folder)
@@ -116,10 +116,10 @@ class Sweep:
         from cfx.app.sweep.summary import SUMMARY, SweepSummary  # imports NumPy
 
         lines = self._close_runs()
-        found = SweepSummary.of(statuses)
-        found.write(self.folder / SUMMARY)
-        print_table(found.table())
-        for sentence in found.sentences():
+        summary = SweepSummary.of(statuses)
+        summary.write(self.folder / SUMMARY)
+        print_table(summary.table())
+        for sentence in summary.sentences():
             print(sentence)
         code = self._count(statuses, code)
         if any(status.code == 0 for status in statuses.values()):

@@ -108,10 +108,10 @@ def metrics_of(folder: Path) -> dict[str, float]:
     from cfx.core.job_folder import read_metrics
 
     try:
-        found = read_metrics(folder / "metrics.json")
+        metrics = read_metrics(folder / "metrics.json")
     except DataError:
         return {}
-    return {name: value for name, value in found.items() if math.isfinite(value)}
+    return {name: value for name, value in metrics.items() if math.isfinite(value)}
 
 
 def data_of(folder: Path) -> dict[str, Any]:
@@ -165,7 +165,7 @@ class Record:
 
         They stand by their folders, in the sweep's order.
         """
-        found: dict[Path, JobStatus] = {}
+        by_folder: dict[Path, JobStatus] = {}
         for marker in sorted(folder.rglob(STATUS)):
             job = marker.parent
             inside = job.relative_to(folder)
@@ -176,10 +176,10 @@ class Record:
             if status is None:
                 continue
             if status.multirun == multirun:
-                found[job] = status
+                by_folder[job] = status
             elif status.code == 0 and status.command == self.command_hash:
-                found[job] = replace(status, before=True)
-        return dict(sorted(found.items(), key=lambda item: item[1].number))
+                by_folder[job] = replace(status, before=True)
+        return dict(sorted(by_folder.items(), key=lambda item: item[1].number))
 
 
 @contextlib.contextmanager
@@ -217,9 +217,9 @@ def find_folder(
     if not _DATED.search(configured):
         return _named_folder(wanted, resumable=resumable)
     if resumable:
-        found = _incomplete_folder(_pattern(configured), command_hash)
-        if found is not None:
-            return found
+        incomplete = _incomplete_folder(_pattern(configured), command_hash)
+        if incomplete is not None:
+            return incomplete
     while True:
         folder = new_folder(wanted)
         lock = _try_lock(folder)
@@ -327,7 +327,9 @@ def job_name(_root_: Any) -> str:
     It is the same for the same overrides in any order.
     """
     task: Any = OmegaConf.to_container(_root_.hydra.overrides.task, resolve=False)
-    given = {one.partition("=")[0]: one for one in task}  # of a key given twice the last one counts
+    given = {
+        override.partition("=")[0]: override for override in task
+    }  # of a key given twice the last one counts
     return content_key([sorted(given.values()), *_sources(_root_)])[:8]
 
 
@@ -341,10 +343,10 @@ def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
     typed: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
     sweeper: Any = OmegaConf.to_container(config.hydra.sweeper, resolve=False)
     params = (sweeper.pop("params", None) or {}).items()
-    asked = [*(f"{key}={value}" for key, value in params), *typed["task"]]
+    overrides = [*(f"{key}={value}" for key, value in params), *typed["task"]]
     values: dict[str, list[str]] = {}
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
-    for override in parser.parse_overrides(asked):
+    for override in parser.parse_overrides(overrides):
         key = override.get_key_element()
         if override.is_discrete_sweep():
             values[key] = sorted(override.sweep_string_iterator())
@@ -382,8 +384,8 @@ def _state_of_data(node: Any) -> list[list[Any]] | None:
             # The dataset complains about a file that is gone, and about a folder without any.
             with contextlib.suppress(OSError, CfxError):
                 for part in partitions(Path(file)):
-                    found = part.stat()
-                    states.append([found.st_size, found.st_mtime_ns])
+                    status = part.stat()
+                    states.append([status.st_size, status.st_mtime_ns])
     return states
 
 

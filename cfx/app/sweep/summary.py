@@ -144,12 +144,12 @@ class SweepSummary:
     @cached_property
     def metrics(self) -> list[MetricInfo]:
         """What else than the error `judge` any of the jobs has measured."""
-        found: dict[str, MetricInfo] = {}
+        infos: dict[str, MetricInfo] = {}
         for job in self.jobs:
             for metric in known_metrics(job.data, job.metrics):
                 if metric.name not in {self.judge.name, "objective"}:
-                    found.setdefault(metric.name, metric)
-        return list(found.values())
+                    infos.setdefault(metric.name, metric)
+        return list(infos.values())
 
     @cached_property
     def rows(self) -> list[dict[str, Any]]:
@@ -247,11 +247,11 @@ class SweepSummary:
             said += f" ({100 * low:+.1f} to {100 * high:+.1f})"
         baseline, comma, part = row["improvement_over"].partition(",")
         said += f"\nover {short_label(baseline)}{comma}{part}"
-        known = {"geometric": geometric}
+        estimates = {"geometric": geometric}
         for name in ("ratio_of_means", "drivers"):
             if row.get(f"improvement_{name}") is not None:
-                known[name] = row[f"improvement_{name}"]
-        return "\n".join([said, *doubts(known)])
+                estimates[name] = row[f"improvement_{name}"]
+        return "\n".join([said, *doubts(estimates)])
 
     def sentences(self) -> list[str]:
         """Returns how the jobs were compared, and which is closest to the drivers."""

@@ -283,21 +283,21 @@ class MetricSet:
         Raises:
             PluginError: there is no metric of a name, or one that is named is broken.
         """
-        found, left_out = [], []
+        infos, left_out = [], []
         for entry in entries_of(chosen):
             try:
-                found.append(made(entry))
+                infos.append(made(entry))
             except PluginError as error:
                 if chosen != "all" or entry.distribution == OWN:
                     raise
                 left_out.append(leave_out(entry.name, entry.distribution, str(error)))
-        return cls(in_order(found), tuple(left_out))
+        return cls(in_order(infos), tuple(left_out))
 
     @classmethod
     def own(cls) -> MetricSet:
         """Makes cfx's own metrics."""
         entries = registry.entries("metric")
-        return cls(in_order([made(one) for one in entries if one.distribution == OWN]))
+        return cls(in_order([made(entry) for entry in entries if entry.distribution == OWN]))
 
 
 def entries_of(chosen: str | Sequence[str] = ALL_OWN) -> tuple[registry.Entry, ...]:
@@ -309,13 +309,13 @@ def entries_of(chosen: str | Sequence[str] = ALL_OWN) -> tuple[registry.Entry, .
     Raises:
         PluginError: there is no metric of a name.
     """
-    usable = [one for one in registry.entries("metric") if not registry.rivals(one)]
+    usable = [entry for entry in registry.entries("metric") if not registry.rivals(entry)]
     if chosen == "all":
         return tuple(usable)
     names = {*ALWAYS, *([chosen] if isinstance(chosen, str) else chosen)}
     if ALL_OWN in names:
         names.remove(ALL_OWN)
-        names.update(one.name for one in usable if one.distribution == OWN)
+        names.update(entry.name for entry in usable if entry.distribution == OWN)
     return tuple(registry.entry("metric", name) for name in sorted(names))
 
 
@@ -342,4 +342,4 @@ def made(entry: registry.Entry) -> MeasuredMetric:
 
 def in_order(metrics: Sequence[MeasuredMetric]) -> tuple[MeasuredMetric, ...]:
     """Returns metrics in the order in which they are shown."""
-    return tuple(sorted(metrics, key=lambda one: (one.metric.order, one.name)))
+    return tuple(sorted(metrics, key=lambda info: (info.metric.order, info.name)))

@@ -199,19 +199,19 @@ class AcrossDrivers(Protocol):
         calibrator, batch = context.calibrator, context.batch
         driver_specific = calibrator.driver_specific(pairs, batch, split.frame)
         pooled = calibrator.pooled(pairs, batch, full.frame, members)
-        found = self._calibrated(
+        calibrated = self._calibrated(
             context, driver_specific, pooled, context.labels(full.windows, driver_specific)
         )
-        policy, training_result = self._learn(context, full, members, found)
+        policy, training_result = self._learn(context, full, members, calibrated)
         calibration = context.calibration_metrics(
-            "driver_specific", split.frame, found.driver_specific
+            "driver_specific", split.frame, calibrated.driver_specific
         )
-        calibration |= context.calibration_metrics("pooled", full.frame, found.pooled, members)
+        calibration |= context.calibration_metrics("pooled", full.frame, calibrated.pooled, members)
         return Trained(
-            test=self._held_out(context, fold, split, found, policy),
+            test=self._held_out(context, fold, split, calibrated, policy),
             fold=fold[fold >= 0],
             curves=training_result.curves,
-            labels=found.labels,
+            labels=calibrated.labels,
             notes=notes,
             calibration=calibration,
         )
@@ -244,17 +244,17 @@ class AcrossDrivers(Protocol):
         return _Calibrated(driver_specific, pooled, start, base, labels)
 
     def _learn(
-        self, context: ProtocolContext, full: Split, members: Tensor, found: _Calibrated
+        self, context: ProtocolContext, full: Split, members: Tensor, calibrated: _Calibrated
     ) -> tuple[Agent, TrainingResult]:
         """Trains a network for each row of `members`, `(K + 1, P)`, on full trajectories."""
         s = self.settings
         names = (*(f"fold {number}" for number in range(len(members) - 1)), ANY_DRIVER)
         if not context.policy.trainable:
-            training_result = context.agents.untrained(context.policy, found.start)
+            training_result = context.agents.untrained(context.policy, calibrated.start)
             policy = context.agents.trained(context.policy, training_result, names)
-            return replace(policy, pooled=found.pooled), training_result
+            return replace(policy, pooled=calibrated.pooled), training_result
         self._warn(context)
-        training_data = _training_data(context, full, members, found, names)
+        training_data = _training_data(context, full, members, calibrated, names)
         training_result = context.learner.fit(context.policy, training_data)
         policy = context.agents.trained(context.policy, training_result, names)
         rule = ContextRule(
@@ -263,7 +263,7 @@ class AcrossDrivers(Protocol):
             history_s=s.history,
             combines=s.combine,
         )
-        return replace(policy, context_rule=rule, pooled=found.pooled), training_result
+        return replace(policy, context_rule=rule, pooled=calibrated.pooled), training_result
 
     def _warn(self, context: ProtocolContext) -> None:
         """Warns of settings that do not fit the learner's."""
@@ -288,13 +288,13 @@ class AcrossDrivers(Protocol):
         context: ProtocolContext,
         fold: Tensor,
         split: Split,
-        found: _Calibrated,
+        calibrated: _Calibrated,
         policy: Agent,
     ) -> HeldOut:
         """Returns the test of the pairs that are tested in some fold."""
         tested = (fold >= 0).nonzero()[:, 0]
         here = tested.to(context.batch.lengths.device)
-        there = tested.to(found.driver_specific.device)
+        there = tested.to(calibrated.driver_specific.device)
         network = fold[tested]
         return HeldOut(
             context=context,
@@ -302,10 +302,10 @@ class AcrossDrivers(Protocol):
             batch=context.batch[here],
             network=network.to(here.device),
             first=split.frame[tested].to(here.device),
-            driver_specific=found.driver_specific[there],
-            base=None if found.base is None else found.base[there],
-            unseen_base=found.start[network.to(found.start.device)],
-            pooled=found.pooled,
+            driver_specific=calibrated.driver_specific[there],
+            base=None if calibrated.base is None else calibrated.base[there],
+            unseen_base=calibrated.start[network.to(calibrated.start.device)],
+            pooled=calibrated.pooled,
             policy=policy,
         )
 
@@ -314,23 +314,23 @@ def _training_data(
     context: ProtocolContext,
     full: Split,
     members: Tensor,
-    found: _Calibrated,
+    calibrated: _Calibrated,
     names: tuple[str, ...],
 ) -> TrainingData:
     """Returns each network's pairs, one network behind the other."""
     network, index = members.nonzero().unbind(1)
     device = context.batch.lengths.device
     rows, network = index.to(device), network.to(device)
-    start = found.start[network]
+    start = calibrated.start[network]
     # Also where both bases are the same: for unseen drivers nothing of their history is observed.
-    base = start if found.base is None else found.base[rows]
+    base = start if calibrated.base is None else calibrated.base[rows]
     pairs = TrainingPairs(
         index=rows,
         split=full[index],
         network=network,
         start=start,
         base=base,
-        labels=None if found.labels is None else found.labels.select(index),
+        labels=None if calibrated.labels is None else calibrated.labels.select(index),
         drivers=tuple(context.pairs[number].driver for number in index.tolist()),
         sites=tuple(context.pairs[number].site for number in index.tolist()),
     )

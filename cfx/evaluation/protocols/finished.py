@@ -131,11 +131,12 @@ class FinishedPolicy:
                 f" {pairs.dt:g} s; set data.time_step={policy.dt:g}"
             )
         learned_from = LearnedFrom(policy.trained_on.pairs)
-        known = [pair.pair_id for pair in pairs if pair in learned_from]
-        if known:
+        learned_pairs = [pair.pair_id for pair in pairs if pair in learned_from]
+        if learned_pairs:
             raise DataError(
-                f"{where}: this policy has learned from {len(known)} of the {len(pairs)} pairs in"
-                f" {pairs.source}, the first of them '{known[0]}'; test it on others"
+                f"{where}: this policy has learned from {len(learned_pairs)} of the {len(pairs)}"
+                f" pairs in {pairs.source}, the first of them '{learned_pairs[0]}'; test it on"
+                " others"
                 " (data.recording, data.pair_ids)"
             )
         if not policy.trained_on.pairs:

@@ -57,11 +57,11 @@ def assign_folds(
         if min_duration is None or pair.lasts(min_duration):
             tested.append(number)
     groups_tested = [groups[number] for number in tested]
-    found = len(set(groups_tested))
-    if found < (folds or 2):
-        raise DataError(_too_few(pairs, folds, together, min_duration, found))
+    group_count = len(set(groups_tested))
+    if group_count < (folds or 2):
+        raise DataError(_too_few(pairs, folds, together, min_duration, group_count))
     if folds is None:
-        folds = found
+        folds = group_count
     splitter = GroupKFold(folds, shuffle=True, random_state=seed)
     fold_of_group: dict[Any, int] = {}
     parts = splitter.split(np.zeros(len(tested)), groups=groups_tested)
@@ -103,22 +103,22 @@ def learned_from(fold: Tensor, folds: int) -> Tensor:
 
 
 def _too_few(
-    pairs: PairSet, folds: int | None, together: Together, min_duration: float | None, found: int
+    pairs: PairSet, folds: int | None, together: Together, min_duration: float | None, groups: int
 ) -> str:
-    what = together if found == 1 else f"{together}s"
+    what = together if groups == 1 else f"{together}s"
     if min_duration:
         what += f" whose pairs last {min_duration:g} s"
-    if together == "site" and found == 1:
+    if together == "site" and groups == 1:
         what += " (name those of its recordings with data.site)"
     more = f"{together}s" if together in {"recording", "site", "vehicle"} else "pairs"
     lower = f"lower protocol.min_test_duration={min_duration:g} or " if min_duration else ""
     if folds is None:
         return (
-            f"protocol.together={together}: {pairs.source} has only {found} {what} here, and one is"
-            f" left out at a time; {lower}use more {more}"
+            f"protocol.together={together}: {pairs.source} has only {groups} {what} here, and one"
+            f" is left out at a time; {lower}use more {more}"
         )
     return (
-        f"protocol.folds={folds}: {pairs.source} has only {found} {what} here; {lower}lower"
+        f"protocol.folds={folds}: {pairs.source} has only {groups} {what} here; {lower}lower"
         f" protocol.folds (2 at least) or use more {more}"
     )
 
@@ -179,8 +179,8 @@ def describe_folds(pairs: PairSet, fold: Tensor, together: Together) -> dict[str
         recordings.append(
             sorted({pair.recording for pair, place in tested_there if place == number})
         )
-    known = [pair for pair in pairs if pair.leader_id != f"ahead of {pair.follower_id}"]
-    if known:
+    with_known_leader = [pair for pair in pairs if pair.leader_id != f"ahead of {pair.follower_id}"]
+    if with_known_leader:
         log.info(
             "%d folds over %d drivers; %d of %d test pairs follow a driver of the training part,"
             " %d test drivers lead one there",
@@ -208,8 +208,8 @@ def describe_folds(pairs: PairSet, fold: Tensor, together: Together) -> dict[str
         "recordings_per_fold": recordings,
         "drivers": len(fold_of_driver),
         "drivers_per_fold": [in_folds.count(number) for number in range(folds)],
-        "test_pairs_behind_a_training_driver": behind_trained if known else None,
-        "test_drivers_who_lead_a_training_pair": len(leaders) if known else None,
+        "test_pairs_behind_a_training_driver": behind_trained if with_known_leader else None,
+        "test_drivers_who_lead_a_training_pair": len(leaders) if with_known_leader else None,
         "pairs_only_learned_from": len(pairs) - tested,
     }
 

@@ -107,10 +107,10 @@ def past_errors(
     stride, batch = context.windows.stride, followers.batch
     cut = (EARLIER * first).long() // stride * stride
     shortest = round(SHORTEST_S / batch.dt)
-    known = (cut >= shortest) & (first - cut >= shortest)
-    found = np.full((4, len(first)), np.nan)
-    if bool(known.any()):
-        rows = known.nonzero()[:, 0]
+    long_enough = (cut >= shortest) & (first - cut >= shortest)
+    errors_by_method = np.full((4, len(first)), np.nan)
+    if bool(long_enough.any()):
+        rows = long_enough.nonzero()[:, 0]
         numbers = rows.tolist()
         pairs = pairs.take(numbers)
         first, cut, network = first[rows], cut[rows], followers.network[rows]
@@ -141,9 +141,9 @@ def past_errors(
             own * of_policy,
             of_driver_specific * of_driver_specific,
         )
-        for row, product in zip(found, products, strict=True):
+        for row, product in zip(errors_by_method, products, strict=True):
             row[numbers] = (product.sum(1) / frames).cpu().numpy()
-    return PastErrors(*found)
+    return PastErrors(*errors_by_method)
 
 
 def expected_error(table: pd.DataFrame, fold: NDArray[np.int64]) -> ExpectedError:
@@ -163,7 +163,7 @@ def expected_error(table: pd.DataFrame, fold: NDArray[np.int64]) -> ExpectedErro
 
 
 def expected_of_unseen(
-    speed: pd.DataFrame, fold: NDArray[np.int64], found: ExpectedError
+    speed: pd.DataFrame, fold: NDArray[np.int64], expected: ExpectedError
 ) -> ExpectedError:
     """Adds what bounds the errors of drivers of whom nothing is known.
 
@@ -173,12 +173,12 @@ def expected_of_unseen(
         found: what their pasts say.
     """
     if not {"policy", "pooled"} <= set(speed):
-        return found
+        return expected
     policy, constant = (
         conformal_bound(speed[method].to_numpy(dtype=np.float64), fold)
         for method in ("policy", "pooled")
     )
-    return replace(found, unseen=policy, unseen_constant=constant)
+    return replace(expected, unseen=policy, unseen_constant=constant)
 
 
 def with_bounds(table: pd.DataFrame, expected: ExpectedError | None) -> pd.DataFrame:

@@ -59,5 +59,5 @@ class Transfer(Protocol):
         return self.finished.determines()
 
     def run(self, context: ProtocolContext) -> ProtocolResult:
-        found = self.finished.tested(context)
-        return found.result(found.test.evaluation())
+        tested = self.finished.tested(context)
+        return tested.result(tested.test.evaluation())

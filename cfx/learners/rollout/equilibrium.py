@@ -130,10 +130,10 @@ class EquilibriumTargets:
 
     def speeds(self, share: Tensor) -> Tensor:
         """Returns speeds at shares `(N, D)` of each network's recorded ones, m/s, on the grid."""
-        known = ~self.gap.isnan()
+        measured = ~self.gap.isnan()
         place = torch.arange(self.gap.shape[1], device=share.device)
-        first = torch.where(known, place, self.gap.shape[1]).amin(1, keepdim=True)
-        last = torch.where(known, place, 0).amax(1, keepdim=True)
+        first = torch.where(measured, place, self.gap.shape[1]).amin(1, keepdim=True)
+        last = torch.where(measured, place, 0).amax(1, keepdim=True)
         return self.speed[(first + share * (last - first)).round().long()]
 
 
@@ -320,8 +320,8 @@ def _of_network(
         return np.full_like(grid, np.nan), np.full(len(drivers), np.nan)
     speed, gap = following.speed.cpu().numpy(), following.gap.cpu().numpy()
     usual = relation.gap_at(speed)
-    known = np.isfinite(gap) & np.isfinite(usual)
-    ratio = np.where(known, (gap + VEHICLE_M) / (usual + VEHICLE_M), 0.0)
-    count = known.sum(1)
+    measured = np.isfinite(gap) & np.isfinite(usual)
+    ratio = np.where(measured, (gap + VEHICLE_M) / (usual + VEHICLE_M), 0.0)
+    count = measured.sum(1)
     mean = np.where(count > 0, ratio.sum(1) / np.maximum(count, 1), np.nan)
     return relation.gap_at(grid), mean

@@ -39,11 +39,11 @@ def folder_of_ready_made(text: str) -> Path:
         DataError: there is no such policy.
     """
     name = text.removeprefix(SCHEME)
-    known = names()
-    if name not in known:
+    options = names()
+    if name not in options:
         raise DataError(
-            f"{text}: there is no ready-made policy '{name}'.{nearest(name, known)}"
-            f" cfx policies lists them: {', '.join(known)}."
+            f"{text}: there is no ready-made policy '{name}'.{nearest(name, options)}"
+            f" cfx policies lists them: {', '.join(options)}."
         )
     return READY_FOLDER / name
 

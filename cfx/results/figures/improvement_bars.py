@@ -114,26 +114,26 @@ def improvement_axis(
         error: which error is smaller.
         what: what is cut off, in the note.
     """
-    title, known = improvement_title(baseline, error), canvas.finite(values)
-    undefined = len(np.asarray(values).ravel()) - len(known)
-    if not len(known):
+    title, finite = improvement_title(baseline, error), canvas.finite(values)
+    undefined = len(np.asarray(values).ravel()) - len(finite)
+    if not len(finite):
         note = f"No pair has a defined improvement ({undefined} are undefined)."
         return ImprovementAxis(-1.0, 1.0, title, note)
-    q1, q3 = np.quantile(known, [0.25, 0.75])
+    q1, q3 = np.quantile(finite, [0.25, 0.75])
     fence = min(float(q1 - _FAR_OUT * (q3 - q1)), WORST_WITHOUT_CUT)
-    lowest = float(known.min())
+    lowest = float(finite.min())
     # The mean and its interval stay in view as long as they do not dwarf the bars themselves.
     near = [mark for mark in canvas.finite(marks) if mark > _FAR_OUT * fence]
     low = min([max(lowest, fence), 0.0, *near])
-    high = max([float(known.max()), 0.0, *canvas.finite(marks)])
+    high = max([float(finite.max()), 0.0, *canvas.finite(marks)])
     margin = _MARGIN * max(high - low, 0.1)
     if lowest >= fence:
         low -= margin
-    count = int((known < low).sum())
+    count = int((finite < low).sum())
     parts = []
     if count:
         parts.append(
-            f"The axis is cut at {wording.percent(low)}: {count} of {len(known)} {what} are lower,"
+            f"The axis is cut at {wording.percent(low)}: {count} of {len(finite)} {what} are lower,"
             f" the lowest is {wording.percent(lowest)}."
         )
     if undefined:

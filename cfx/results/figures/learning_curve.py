@@ -37,14 +37,14 @@ def loss_quartiles(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
     Returns:
         By column of `table`; a row per epoch, columns 0.25, 0.5 and 0.75.
     """
-    found = {}
+    quartiles = {}
     for column in _COLUMNS:
         losses = curves.over_networks(table, column)
         if not losses.empty:
             count = min(_MOST_POINTS, len(losses))
             kept = np.unique(np.linspace(0, len(losses) - 1, count).round().astype(int))
-            found[column] = losses.iloc[kept].quantile((0.25, 0.5, 0.75), axis=1).T
-    return found
+            quartiles[column] = losses.iloc[kept].quantile((0.25, 0.5, 0.75), axis=1).T
+    return quartiles
 
 
 def _logarithmic_ticks(values: canvas.Array) -> list[float]:

@@ -160,13 +160,13 @@ def _range(lines: Sequence[canvas.Line]) -> tuple[float | None, float | None]:
 
 
 def _collisions(lines: Sequence[canvas.Line]) -> tuple[tuple[str, float, float], ...]:
-    found = []
+    collisions = []
     for line in lines:
         hit = np.flatnonzero(line.values < 0)
         if line.method != "real" and not line.hidden and len(hit):
             first = int(hit[0])
-            found.append((line.method, float(line.time[first]), float(line.values[first])))
-    return tuple(found)
+            collisions.append((line.method, float(line.time[first]), float(line.values[first])))
+    return tuple(collisions)
 
 
 def _parameter_panel(parameter: ParameterAxis, lines: tuple[canvas.Line, ...]) -> Panel:

@@ -74,7 +74,7 @@ def parameter_spreads(
         table: a row per pair and method with columns `method` and `parameter_NAME`.
         axes: the tuned parameters.
     """
-    found = []
+    spreads = []
     for axis in axes:
         column = f"parameter_{axis.name}"
         if column not in table or axis.low is None or axis.high is None or axis.high <= axis.low:
@@ -83,8 +83,8 @@ def parameter_spreads(
         default = _known(table, "default", column)
         if len(values) and len(default):
             pooled = np.unique(_known(table, "pooled", column))
-            found.append(ParameterSpread(axis, values, pooled, float(default[0])))
-    return tuple(found)
+            spreads.append(ParameterSpread(axis, values, pooled, float(default[0])))
+    return tuple(spreads)
 
 
 def _known(table: pd.DataFrame, method: str, column: str) -> canvas.Array:

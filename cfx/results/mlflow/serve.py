@@ -184,7 +184,7 @@ def _close_abandoned(store: str) -> None:
     from cfx.results.mlflow.tracker import close_abandoned
 
     with translate_errors(f"close abandoned runs in {store}"):
-        names = [one.name for one in _client(store).search_experiments()]
+        names = [experiment.name for experiment in _client(store).search_experiments()]
         for name in names:
             opened = open_store(store, name)
             with opened.locked():
@@ -226,12 +226,12 @@ def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
     jobs = client.search_runs([experiment], chosen, max_results=1000)
     error = common_error(jobs)
     groups = _over_seeds(jobs, error)
-    found = list(itertools.chain.from_iterable(groups))
+    runs = list(itertools.chain.from_iterable(groups))
     table = _shared_view(client, experiment, chosen, error)
-    title = f"sweep {name}, {_began(parent)}: {len(found)} jobs"
+    title = f"sweep {name}, {_began(parent)}: {len(runs)} jobs"
     if groups:
         title += _best(groups[0], error)
-    tested = {run.data.tags.get(TESTED, "") for run in found} - {""}
+    tested = {run.data.tags.get(TESTED, "") for run in runs} - {""}
     if len(tested) > 1:
         title += f"; tested on {len(tested)} sets of pairs, which do not compare ({TESTED})"
     lines = [
@@ -239,10 +239,10 @@ def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
         f"  table:   {address}{table}",
         f"  charts:  {address}{table}&compareRunsMode=CHART",
     ]
-    if len(found) > 1:
-        ids = [str(run.info.run_id) for run in found[:COMPARED]]
+    if len(runs) > 1:
+        ids = [str(run.info.run_id) for run in runs[:COMPARED]]
         line = f"  compare: {address}{_compare_page(experiment, ids)}"
-        if len(found) > COMPARED:
+        if len(runs) > COMPARED:
             line += f" (the best {COMPARED})"
         lines.append(line)
     return lines
@@ -289,7 +289,7 @@ def _experiment_lines(client: MlflowClient, names: dict[str, str], address: str)
     """Returns a page for each experiment that holds jobs, or for each if none does."""
     from cfx.results.mlflow.tracker import common_error
 
-    used = [one for one in names if client.search_runs([one], max_results=1)]
+    used = [name for name in names if client.search_runs([name], max_results=1)]
     lines = []
     for experiment in used or names:
         chosen = "tags.`cfx.sweep_parent` IS NULL"

@@ -447,15 +447,15 @@ def _answers(uri: str) -> None:
 
 
 def _experiment(client: MlflowClient, uri: str, name: str, home: Path | None) -> str:
-    found = client.get_experiment_by_name(name)
-    if found is None:
+    experiment = client.get_experiment_by_name(name)
+    if experiment is None:
         location = None
         if home is not None:
             location = artifact_folder(home).as_uri()
         return str(client.create_experiment(name, artifact_location=location))
-    if found.lifecycle_stage != "active":
+    if experiment.lifecycle_stage != "active":
         raise TrackingError(
             f"the experiment '{name}' is deleted in {uri}; restore it there, or set"
             " tracking.experiment to another name"
         )
-    return str(found.experiment_id)
+    return str(experiment.experiment_id)

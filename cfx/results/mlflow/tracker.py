@@ -152,13 +152,13 @@ class MlflowTracker(Tracker):
             TrackingError: the store cannot be used.
         """
         store = open_store(uri, experiment)
-        known = _clean_parameters(parameters)
+        cleaned = _clean_parameters(parameters)
         every = {
             **provenance.git_state(Path.cwd()),
             **provenance.plugin_tags(plugins or {}),
             **provenance.process_tags(),
             "cfx.version": provenance.version(),
-            "cfx.app.job": _fingerprint(whole or known, tags or {}),
+            "cfx.app.job": _fingerprint(whole or cleaned, tags or {}),
             "mlflow.source.name": "cfx",
             "mlflow.source.type": "LOCAL",
             "mlflow.user": provenance.user(),
@@ -170,7 +170,7 @@ class MlflowTracker(Tracker):
             if sweep is not None:
                 parent_id = _sweep_parent(store, sweep)
                 every |= {"cfx.sweep": _safe(sweep), "mlflow.parentRunId": parent_id}
-            run_id = _begin(store, run_name, known, every)
+            run_id = _begin(store, run_name, cleaned, every)
             if sweep is not None:
                 _replace_earlier(store, run_id, every)
         data = (tags or {}).get("data", "")
@@ -318,7 +318,7 @@ class MlflowTracker(Tracker):
                 **_example(folder, example),
                 pip_requirements=[
                     f"cfx-driving=={provenance.version()}",
-                    *(f"{name}=={found}" for name, found in self._plugins.items()),
+                    *(f"{name}=={version}" for name, version in self._plugins.items()),
                 ],
                 mlflow_model=Model(
                     artifact_path=model.artifact_location,
@@ -485,7 +485,7 @@ def sweep_link(experiment_id: str, sweep: str, error: str = DEFAULT_ERROR) -> st
 
     They stand side by side, the smallest error first.
     """
-    asked = {
+    query = {
         "searchFilter": f"tags.`cfx.sweep` = '{_safe(sweep)}'",
         # Sorted by date, MLflow's page would fold the jobs away under their parent, and draw no
         # charts.
@@ -494,7 +494,7 @@ def sweep_link(experiment_id: str, sweep: str, error: str = DEFAULT_ERROR) -> st
         "compareRunsMode": "CHART",
         "workflowType": "machine_learning",
     }
-    return f"#/experiments/{experiment_id}/runs?" + urlencode(asked, quote_via=quote)
+    return f"#/experiments/{experiment_id}/runs?" + urlencode(query, quote_via=quote)
 
 
 def end_sweep(uri: str, experiment: str, sweep: str) -> tuple[str, ...]:
@@ -540,17 +540,17 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
         if not _is_running(run)
     ]
     if left:
-        run, known = left[0], left[0].data.params
+        run, logged = left[0], left[0].data.params
         client.update_run(run.info.run_id, status="RUNNING", name=name)
         if "cfx.failure" in run.data.tags:
             client.delete_tag(run.info.run_id, "cfx.failure")
     else:
         # With its tags from the start: whoever finds it after a kill knows whose it was.
         whose = {tag.key: tag.value for tag in _tags(tags)}
-        run, known = client.create_run(store.experiment_id, run_name=name, tags=whose), {}
+        run, logged = client.create_run(store.experiment_id, run_name=name, tags=whose), {}
     run_id = str(run.info.run_id)
     try:
-        missing = [Param(key, value) for key, value in parameters.items() if key not in known]
+        missing = [Param(key, value) for key, value in parameters.items() if key not in logged]
         client.log_batch(run_id, params=missing, tags=_tags(tags))
         folder = _local(run.info.artifact_uri)
         if folder is not None:
@@ -624,12 +624,12 @@ def _sweep_parent(store: Store, sweep: str) -> str:
     client, name = store.client, _safe(sweep)
     # The parent has not the children's tag: a table filtered by `cfx.sweep` shows the jobs alone,
     # flat, and so do its charts.
-    found = client.search_runs(
+    runs = client.search_runs(
         [store.experiment_id], f"tags.`cfx.sweep_parent` = '{name}'", max_results=1
     )
-    if found:
-        client.update_run(found[0].info.run_id, status="RUNNING")
-        return str(found[0].info.run_id)
+    if runs:
+        client.update_run(runs[0].info.run_id, status="RUNNING")
+        return str(runs[0].info.run_id)
     note = f"[All jobs of this sweep]({sweep_link(store.experiment_id, sweep)})"
     tags = {
         "cfx.sweep_parent": name,
@@ -672,10 +672,10 @@ def _clean_parameters(parameters: Mapping[str, str]) -> dict[str, str]:
 def _tags(tags: Mapping[str, str]) -> list[Any]:
     from mlflow.entities import RunTag
 
-    found = []
+    named = []
     for key, value in tags.items():
-        found.append(RunTag(key[:_KEY_LENGTH], _shortened(value, _TAG_LENGTH)))
-    return found
+        named.append(RunTag(key[:_KEY_LENGTH], _shortened(value, _TAG_LENGTH)))
+    return named
 
 
 def _shortened(text: str, length: int) -> str:
@@ -711,8 +711,8 @@ def _address(uri: str) -> tuple[str, tuple[str, ...]]:
         return uri.rstrip("/"), ()
     # A program may have set the environment's URI itself; a shell does not know it then. Other
     # databases' URIs hold passwords.
-    known = uri == tracking_uri(None)
+    is_default = uri == tracking_uri(None)
     if uri.startswith("sqlite"):
-        known = known and "MLFLOW_TRACKING_URI" not in os.environ
-    where = "" if known else f" --uri {shlex.quote(uri)}"
+        is_default = is_default and "MLFLOW_TRACKING_URI" not in os.environ
+    where = "" if is_default else f" --uri {shlex.quote(uri)}"
     return "http://127.0.0.1:5000", (f"To see it in MLflow: python -m cfx ui{where}",)

@@ -192,14 +192,14 @@ def _begin(varied: Sequence[bool], terms: int, width: int, shift: int) -> list[s
 
 def _constant_in_time(program: StepProgram, varied: Sequence[bool]) -> list[Assignment]:
     """Returns the statements that depend on parameters alone, such as IDM's 2 sqrt(a b)."""
-    known = set(parameter_names(len(varied)))
-    found = []
+    constant = set(parameter_names(len(varied)))
+    constant_statements = []
     for statement in program.statements:
         names = [operand for operand in statement.operands if not operand.startswith("real(")]
-        if names and known.issuperset(names) and not statement.is_condition:
-            known.add(statement.name)
-            found.append(statement)
-    return found
+        if names and constant.issuperset(names) and not statement.is_condition:
+            constant.add(statement.name)
+            constant_statements.append(statement)
+    return constant_statements
 
 
 def _before(constant: Sequence[Assignment], varied: Sequence[bool]) -> list[str]:
