@@ -73,16 +73,17 @@ class PriorStrength:
         """Returns the choice and what it was chosen from, as a sentence."""
         if not self.pairs:
             return (
-                f"The prior of driver-specific parameters has the weight {self.weight:g}: no pair"
-                " can be driven on the first and the last third of what is calibrated on"
+                "The prior draws driver-specific parameters towards the default with the weight"
+                f" {self.weight:g}: no pair can be driven on the first and the last third of what"
+                " is calibrated on"
             )
         tried = [f"{weight:g}: {error:.3f}" for weight, error in self.errors.items()]
         shown = f"{listed(tried, len(tried))} {unit}".rstrip()
         return (
-            f"The prior of driver-specific parameters has the weight {self.weight:.2g}: errors of"
-            f" {self.pairs} pairs on the first and the last third of what is calibrated on, each"
-            f" left out in turn, by weight: {shown}"
-            " (calibration.prior=none: without)"
+            "The prior draws driver-specific parameters towards the default with the weight"
+            f" {self.weight:.2g}: where a curve through errors on thirds that were left out"
+            f" ({self.pairs} pairs) is lowest, times 2/3, since all three thirds are calibrated on;"
+            f" by weight {shown} (calibration.prior=none: without)"
         )
 
     def to_json(self) -> dict[str, object]:

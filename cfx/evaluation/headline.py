@@ -146,7 +146,9 @@ def headline(
 ) -> tuple[dict[str, float], str]:
     """Returns a job's headline.
 
-    A job without a method `policy` is a calibration.
+    A job without a method `policy` is a calibration. Beside the errors of the policy and of what it
+    is compared with stand those of constant sets that err less than the latter: a policy that is
+    better than a bad baseline is not good yet.
 
     Args:
         metrics: the job's, under their names in MLflow.
@@ -157,8 +159,7 @@ def headline(
     """
     compared = main_comparison(metrics, judge.name)
     values: dict[str, float] = {}
-    is_calibration = key_of(judge.name, "policy") not in metrics and compared is None
-    words = ["calibration"] if is_calibration else []
+    words = []
     if compared is not None:
         words.append(_improvement(metrics, compared, values))
     errors = {judge.name: (judge.heading, judge.unit), **ERRORS}
@@ -198,7 +199,12 @@ def _error_said(heading: str, unit: str, measured: Mapping[str, float], baseline
     if "policy" in measured:
         text = f"{heading} {measured['policy']:.3f}{unit}"
         if baseline in measured:
-            text += f" ({_CONSTANT[baseline]} {measured[baseline]:.3f}{unit})"
+            beside = [baseline]
+            for method in _CONSTANT:
+                if measured.get(method, math.inf) < measured[baseline]:
+                    beside.append(method)
+            sets = [f"{_CONSTANT[method]} {measured[method]:.3f}{unit}" for method in beside]
+            text += f" ({', '.join(sets)})"
         return text
     sets = []
     for method, error in measured.items():

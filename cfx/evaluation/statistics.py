@@ -403,12 +403,13 @@ def verdict(ranking: Ranking) -> str:
         ahead += is_significant and comparison.improvement.geometric > 0
     next_best, improvement = ranking.against[0], ranking.against[0].improvement
     text = f"Closest to the drivers: {next_best.best}"
+    others = len(ranking.against)
     if not ahead:
         text += ", but not significantly"
-    elif ahead == len(ranking.against):
+    elif ahead == others:
         text += ", significantly"
     else:
-        text += f", significantly closer than {ahead} of {len(ranking.against)} others"
+        text += f", but significantly than {ahead} of {others} others alone"
     interval = "one driver"
     if math.isfinite(improvement.ci95_low):
         interval = f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"

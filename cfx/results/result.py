@@ -255,9 +255,13 @@ class Result:
         return str(over or "")
 
     def method_label(self, method: str) -> str:
-        """Returns how a table names a method: of pooled parameters with whose they are."""
-        over = f" over {self.pooled_over}" if method == "pooled" and self.pooled_over else ""
-        return f"{short_label(method)}{over}"
+        """Returns how a table names a method: pooled over whom, shrunk towards what."""
+        label = short_label(method)
+        if method == "pooled" and self.pooled_over:
+            label += f" over {self.pooled_over}"
+        if method == "shrunk":
+            label += " towards the default"
+        return label
 
     def scope_label(self, scope: str) -> str:
         """Returns how a part of the trajectories is named."""

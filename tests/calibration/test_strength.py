@@ -25,7 +25,7 @@ def test_it_is_where_a_parabola_has_the_least_error_for_all_that_may_be_used() -
     assert PriorStrength({0.01: 3.0, 0.1: 2.0, 1.0: 1.0}, 5).weight == pytest.approx(FITTED)
     assert PriorStrength({0.01: 1.0, 0.1: 2.0, 1.0: 3.0}, 5).weight == WEIGHTS[0]
     assert PriorStrength({0.01: math.nan, 0.1: math.nan}, 5).weight == WEIGHTS[0]
-    assert "by weight: 0.01: 2.000, 0.1: 1.000, 1: 2.000 m/s" in tried.worded("m/s")
+    assert "by weight 0.01: 2.000, 0.1: 1.000, 1: 2.000 m/s" in tried.worded("m/s")
 
 
 @pytest.fixture

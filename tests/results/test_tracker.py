@@ -613,5 +613,5 @@ def test_a_calibration_logs_no_improvement(
         log_job(run, dataclasses.replace(made, evaluation=evaluation), saved_policy)
     kept = client.get_run(run.run_id).data
     assert not [name for name in kept.metrics if "improvement" in name]
-    assert kept.tags["result"].startswith("calibration; RMSE of speed driver-specific")
+    assert kept.tags["result"].startswith("RMSE of speed driver-specific")
     assert kept.tags["learner"] == "none"

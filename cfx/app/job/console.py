@@ -137,7 +137,9 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
             table.add_column("where\nfitted", justify="right")
     baselines = result.baselines(scope) if with_improvement else ()
     if baselines:
-        table.add_column("policy better by %\n(95 % interval)", justify="right", no_wrap=True)
+        table.add_column(
+            "policy better by %,\nmean over drivers\n(95 % interval)", justify="right", no_wrap=True
+        )
     for method in evaluation.methods:
         values = [metrics.get(key_of(metric.name, method, scope)) for metric in shown]
         if all(value is None for value in values):
@@ -149,7 +151,11 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
                 cells.append(_cell(metric, fitted[metric.name].get(method)))
         if method in baselines:
             cells.append(_improvement_cell(evaluation.improvements[scope][method]))
-        label = result.method_label(method).replace(" over ", "\nover ")
+        label = (
+            result.method_label(method)
+            .replace(" over ", "\nover ")
+            .replace(" towards ", "\ntowards ")
+        )
         table.add_row(label, *cells)
     return table
 

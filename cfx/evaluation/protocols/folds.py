@@ -182,8 +182,8 @@ def describe_folds(pairs: PairSet, fold: Tensor, together: Together) -> dict[str
     with_known_leader = [pair for pair in pairs if pair.leader_id != f"ahead of {pair.follower_id}"]
     if with_known_leader:
         log.info(
-            "%d folds over %d drivers; %d of %d test pairs follow a driver of the training part,"
-            " %d test drivers lead one there",
+            "%d folds over %d drivers; test pairs behind a driver of the training part: %d of %d;"
+            " tested drivers who lead one there: %d (both share the leader's trajectory alone)",
             folds,
             len(fold_of_driver),
             behind_trained,
