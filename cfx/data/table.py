@@ -451,12 +451,17 @@ def _ignored(source: _Source, matches: Mapping[str, _Found]) -> list[str]:
     return ignored
 
 
+def _such_cells(count: int) -> str:
+    return "1 such cell" if count == 1 else f"{count} such cells"
+
+
 def _require_names(table: Table, name: str, labels: NameColumn) -> None:
     """Raises DataError for an empty cell of a column of names."""
     empty = np.flatnonzero(labels.codes < 0)
     if len(empty):
         raise DataError(
-            f"{table.at(empty[0], name)}: the cell is empty ({len(empty)} such cells); give a name"
+            f"{table.at(empty[0], name)}: the cell is empty ({_such_cells(len(empty))}); give"
+            " a name"
         )
 
 
@@ -471,7 +476,7 @@ def _require_numbers(table: Table, name: str, values: Floats, column: FileColumn
         if np.isnan(values[at[0]]):
             what = "empty or NaN"
         raise DataError(
-            f"{table.at(at[0], name)}: the cell is {what} ({len(at)} such cells in this column);"
+            f"{table.at(at[0], name)}: the cell is {what} ({_such_cells(len(at))} in this column);"
             f" {table.layout.remedy}"
         )
     wrong = (values < column.least) | (values <= column.above) | (values > column.most)

@@ -85,7 +85,8 @@ def _check_template(kind: registry.Kind) -> None:
         raise PluginError(
             f"there is no template of the kind '{kind.name}'; there are templates of:"
             f" {', '.join(kinds)}. Write a class that extends {kind.base.replace(':', '.')} and an"
-            f" entry point of the group {kind.entry_points}"
+            f" entry point of the group {kind.entry_points}; plugins/cfx-example has one of each"
+            " kind to copy"
         )
 
 
@@ -149,10 +150,8 @@ def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
 
 def _usage(kind: registry.Kind, name: str) -> str:
     """Returns what a user types to see a component at work."""
-    if kind.name == "figure":
-        return "python -m cfx  # every job that has what it shows draws it"
     arguments = kind.call(name).removeprefix("cfx ")
-    if kind.name in {"metric", "table"}:
+    if kind.name in {"metric", "table", "figure"}:
         arguments = f"{kind.group}{'' if kind.name == 'metric' else 's'}=[own,{name}]"
     if kind.name == "input":
         arguments = f"policy.inputs=[situation,{name}]"

@@ -63,7 +63,8 @@ class BenchmarkCommand(Command):
             "--output",
             type=Path,
             metavar="FOLDER",
-            help="of the row; default: outputs/benchmark/NAME, of roads .../roads/NAME",
+            help="of the row; default: outputs/benchmark/NAME, of roads outputs/benchmark/roads-1/NAME;"
+            " of roads the baseline's row and the recordings lie beside it",
         )
         made.add_argument(
             "--submission",
@@ -180,6 +181,11 @@ def _print(
     row = mine.row
     print(f"\nThe row, on {row.pairs} pairs of {row.drivers} unseen drivers:\n")
     print("\n".join(lines_of_row(mine)))
+    if options.quick:
+        print(
+            "\nTwo roads, where each is learned from the other alone: this shows that a method"
+            " runs, not how good it is; leave --quick out for that."
+        )
     for file, table in others:
         print("\n".join(["", *lines_of(compared(mine.errors, table, file))]))
     print(f"\nThe row: {folder / ROW}\nErrors of each pair: {folder / PAIRS}")

@@ -186,6 +186,11 @@ def _require_each(
     for wrong, what in ((given > 1, "stands there twice"), (asked & (given == 0), "is missing")):
         if wrong.any():
             row, frame = np.argwhere(wrong)[0]
+            if not given[row].any():
+                raise DataError(
+                    f"{source}: pair '{segments.pair_ids[row]}' is missing, in '{task}': all pairs"
+                    " of a task are asked for, or none"
+                )
             raise DataError(
                 f"{source}, column time_s: {frame * segments.pairs.dt:g} s of pair"
                 f" '{segments.pair_ids[row]}' {what}, in '{task}'"
