@@ -755,8 +755,8 @@ class Past(ResultTable):
         if ratio > _WORSE:
             yield (
                 f"[yellow]Expect {ratio:.1f} times the error of driver-specific parameters from"
-                " this policy alone: it learned from no drivers like these. Train on recordings like"
-                " this one."
+                " this policy alone: it learned from no drivers like these. Train on recordings"
+                " like this one."
             )
 
 
