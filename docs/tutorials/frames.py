@@ -41,8 +41,8 @@ except cfx.errors.CfxError as error:
 # %% [markdown]
 # ## One model
 #
-# Driver-specific parameters are calibrated on the first 80 % of each driver's trajectory. The weak
-# prior holds a parameter that the recording does not determine near the model's default.
+# Driver-specific parameters are calibrated on the first 80 % of each driver's trajectory. A prior,
+# as strong as predicts them best, holds what the recording does not determine near the default.
 
 # %%
 fit = cfx.calibrate(pairs, "idm", objective="gap_rmse")
