@@ -453,8 +453,9 @@ def _requirements_unchecked() -> Iterator[None]:
     Ours are what is installed, and the warning would not be shown. For the comparison MLflow reads
     the list of files of every distribution: a second of each job that trains.
     """
-    from mlflow.utils import environment
+    from mlflow.utils import environment as of_mlflow
 
+    environment: Any = of_mlflow  # it is not in MLflow's interface
     compare = environment.warn_dependency_requirement_mismatches
     environment.warn_dependency_requirement_mismatches = _nothing
     try:
