@@ -67,7 +67,26 @@ JOBS = {
         f" {RECONSTRUCTED} data.min_duration=70",
     ),
     "history-krauss": Job("Krauss, with history", f"experiment=with_history {ONE} {I80}"),
+    "history-krauss-offset": Job(
+        "Krauss, `learner.head=offset`", f"experiment=with_history learner.head=offset {ONE} {I80}"
+    ),
+    "history-krauss-motion": Job(
+        "Krauss, `policy.inputs=motion`",
+        f"experiment=with_history policy.inputs=motion {ONE} {I80}",
+    ),
     "conditioned-idm": Job("IDM, with history", f"experiment=conditioned model=idm {ONE} {I80}"),
+    "conditioned-idm-offset": Job(
+        "IDM, `learner.head=offset`",
+        f"experiment=conditioned model=idm learner.head=offset {ONE} {I80}",
+    ),
+    "conditioned-idm-motion": Job(
+        "IDM, `policy.inputs=motion`",
+        f"experiment=conditioned model=idm policy.inputs=motion {ONE} {I80}",
+    ),
+    "conditioned-idm-plain": Job(
+        "IDM, `policy.driver_features=[]`",
+        f"experiment=conditioned model=idm policy.driver_features=[] {ONE} {I80}",
+    ),
     "conditioned-w99": Job("Wiedemann 99, with history", f"experiment=conditioned {ONE} {I80}"),
     "unseen-krauss": Job("Krauss, unseen drivers", f"experiment=unseen_drivers {I80}"),
     "unseen-krauss-smooth": Job(
@@ -103,8 +122,20 @@ JOBS = {
     "forecast-recalibrate-residual": Job(
         "recalibrated + residual", f"policy=recalibrate policy.residual=true {FORECAST}"
     ),
+    "forecast-recalibrate-no-prior": Job(
+        "`policy.prior=0`", f"policy=recalibrate policy.prior=0 {FORECAST}"
+    ),
+    "forecast-recalibrate-long": Job(
+        "`policy.window_s=100 policy.prior=0.1`",
+        f"policy=recalibrate policy.window_s=100 policy.prior=0.1 {FORECAST}",
+    ),
     "forecast-ukf": Job("UKF", f"policy=ukf {FORECAST}"),
     "forecast-ukf-residual": Job("UKF + residual", f"policy=ukf policy.residual=true {FORECAST}"),
+    "forecast-ukf-low-noise": Job("`policy.noise=0.5`", f"policy=ukf policy.noise=0.5 {FORECAST}"),
+    "forecast-ukf-fast-drift": Job(
+        "`policy.drift=0.05 policy.noise=4`",
+        f"policy=ukf policy.drift=0.05 policy.noise=4 {FORECAST}",
+    ),
     "forecast-particles": Job("particle filter", f"policy=particle_filter {FORECAST}"),
     "forecast-particles-residual": Job(
         "particle filter + residual", f"policy=particle_filter policy.residual=true {FORECAST}"

@@ -47,10 +47,8 @@ MEASURED_OTHERWISE = {
     "docs/readers.md": "tests/benchmarks, named on the page",
     "docs/roads.md": "cards of ready-made policies",
     "docs/speed.md": "tests/benchmarks, named on the page",
-    "docs/stochastic.md": "older code, as the page says",
     "docs/sumo.md": "benchmarks of plugins/cfx-sumo, named on the page",
     "docs/traffic.md": "`cfx drive stress`, `experiment=traffic`",
-    "docs/tried.md": "older code, as the page says",
 }
 """Documents, or folders of them, whose other figures have another source, and which."""
 

@@ -60,8 +60,6 @@ def test_other_figures_have_another_source() -> None:
         entry = TABLES.entry_of(name)
         assert entry, f"{name}: {stray}"
         unused.discard(entry)
-        is_older = TABLES.MEASURED_OTHERWISE[entry].startswith("older code")
-        assert ("of older code" in page) == is_older, name
     assert not unused, "pages without such figures"
 
 

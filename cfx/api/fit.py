@@ -61,7 +61,7 @@ class Fit:
     Attributes:
         experiment: the configuration, with the command that repeats it.
         recorded: what was calibrated on.
-        parameters: a row per pair: the driver's own parameters, SI units.
+        parameters: a row per pair: driver-specific parameters, SI units.
         ends_apart: by which share of the loss independent ends of each pair's search differ. Above
             0.01 the optimum may have been missed; NaN where the optimizer has no such ends.
     """
@@ -87,8 +87,8 @@ class Fit:
     def pooled(self) -> pd.Series:
         """One set of parameters for all these drivers, SI units, pooled over themselves.
 
-        It minimises the mean of their losses on the same frames as their own sets do; it is found
-        when it is first asked for. A job's `pooled` is calibrated on other drivers.
+        It minimises the mean of their losses on the same frames as driver-specific ones do; it is
+        found when it is first asked for. A job's `pooled` is calibrated on other drivers.
         """
         import torch
 
@@ -473,7 +473,7 @@ def _context_of(
 def compare(*jobs: Fit | Result, **named: Fit | Result) -> Comparison:
     """Compares fits and jobs: which is closest to the drivers, and is it chance.
 
-    Each is judged by its policy, a fit and a calibration by the drivers' own parameters, on the
+    Each is judged by its policy, a fit and a calibration by driver-specific parameters, on the
     test part. Only those that were tested on the same frames of the same pairs are ranked.
 
     Args:

@@ -1,1 +1,1 @@
-"""Calibration: fixed parameters of a pair, labels of its windows, and their cache."""
+"""Calibration: driver-specific and pooled parameters, labels of windows, and their cache."""

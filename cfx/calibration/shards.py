@@ -54,7 +54,8 @@ class Solver:
         objective: what is minimised.
         memory: bound for one shard, bytes.
         prior: weight of the prior on driver-specific and pooled parameters
-            (`cfx.calibration.losses`); 0: none. Labels have none: ties go to the driver's own set.
+            (`cfx.calibration.losses`); 0: none. Labels have none: ties go to
+            driver-specific parameters.
         chooses_prior: that of driver-specific ones is chosen (`cfx.calibration.strength`).
         pooled_segment_s: length of the segments that pooled parameters are calibrated on, s; None:
             whole trajectories.

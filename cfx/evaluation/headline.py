@@ -128,7 +128,7 @@ def doubts(statistics: Mapping[str, float]) -> list[str]:
 
 
 def main_error(metrics: Mapping[str, float], judge: str) -> float:
-    """Returns the error that a job is judged by: the policy's; of a calibration its own set's.
+    """Returns the error that a job is judged by: the policy's; of a calibration driver-specific.
 
     Args:
         metrics: the job's.

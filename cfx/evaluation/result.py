@@ -48,7 +48,7 @@ All start from the same measured state and are compared on the same frames.
 `default`: the model's default parameters.
 `pooled`: one set, calibrated jointly on the training drivers (pooled calibration), none of whom
 is tested.
-`driver_specific`: the driver's own set, calibrated on the first part of the trajectory.
+`driver_specific`: a set for each driver, calibrated on the first part of their own trajectory.
 `shrunk`: that set shrunk towards the default and kept constant. A policy of offsets starts from it
 where it is not `driver_specific` itself; it separates what adapting adds from what shrinking does.
 `policy`: parameters that a policy chooses for each window.

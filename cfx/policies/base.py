@@ -169,7 +169,7 @@ class Policy(Component):
         Args:
             features: f.
             default: the model's default parameters in unit space, `(n,)`.
-            fixed: each network's fixed parameters in unit space, `(N, n)`; N is read from it.
+            fixed: what each untrained network answers in unit space, `(N, n)`; N is read from it.
             generator: for the initial weights, on the CPU.
         """
 

@@ -1,4 +1,4 @@
-"""Policies of constant parameters, which no learner trains: the baselines `default` and `fixed`."""
+"""Policies of constant parameters, which no learner trains: default and driver-specific ones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cfx.policies.base import ConstantNetwork, Policy, PolicyNetwork, ResidualSe
 
 
 class FixedPolicy(Policy):
-    """Answers the fixed parameters that calibration found, always."""
+    """Answers driver-specific parameters, always."""
 
     schema: ClassVar[type[Settings]] = ResidualSettings
     settings: ResidualSettings

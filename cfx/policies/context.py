@@ -37,12 +37,12 @@ class ContextRule:
     """Makes a driver's context for an agent, as in training.
 
     Attributes:
-        driver_specific: the base is the driver's own calibrated parameters where these are known;
+        driver_specific: the base is driver-specific parameters where these are known;
             otherwise it is the agent's base for every driver.
         shrinkage: how far these parameters are shrunk towards the model's default, 0 to 1.
         history_s: measured history that the agent observes before a test, s; None: all there is.
-        combines: the driver's own calibrated parameters drive beside the agent, where they are
-            known (`cfx.evaluation.protocols.past`).
+        combines: driver-specific parameters drive beside the agent, where they are known
+            (`cfx.evaluation.protocols.past`).
     """
 
     driver_specific: bool = True
@@ -63,10 +63,10 @@ class ExpectedError:
 
     Attributes:
         policy: factor on the error in a driver's past, of the policy as it was tested, beside
-            drivers' own parameters if it was so.
-        own: the same of the drivers' own parameters.
+            driver-specific parameters if it was so.
+        own: the same of driver-specific parameters.
         unseen: m/s, for drivers of whom nothing is known: RMSE over full trajectories.
-        unseen_constant: the same of constant parameters, pooled over others.
+        unseen_constant: the same of parameters pooled over the other drivers.
     """
 
     policy: float | None = None
@@ -80,12 +80,13 @@ class ExpectedError:
             return ""
         words = (
             f"of {LEVEL:.0%} of drivers who were left out of its training the RMSE of speed was"
-            f" below {self.unseen:.2f} m/s (constant parameters: {self.unseen_constant:.2f} m/s)"
+            f" below {self.unseen:.2f} m/s (pooled over the other drivers:"
+            f" {self.unseen_constant:.2f} m/s)"
         )
-        if self.unseen > self.unseen_constant:
-            ratio = self.unseen / self.unseen_constant
+        ratio = self.unseen / self.unseen_constant
+        if round(ratio, 1) > 1.0:
             words += (
-                f"; expect {ratio:.1f} times the error of constant parameters: train on recordings"
+                f"; expect {ratio:.1f} times the error of pooled parameters: train on recordings"
                 " of such drivers"
             )
         return words

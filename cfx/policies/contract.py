@@ -34,7 +34,7 @@ def random_tokens(policy: Policy) -> Tensor:
 
 def answers_in_the_precision_of_a_job(policy: Policy) -> None:
     # A learner trains in single precision; what needs no training computes in double precision, so
-    # that constants stay what they are.
+    # that constant parameters stay what they are.
     dtype = torch.float64
     if policy.trainable:
         dtype = torch.float32

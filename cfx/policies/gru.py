@@ -34,7 +34,7 @@ class GruPolicy(Policy):
     """The paper's policy: a recurrent network whose outputs stay in the parameters' bounds.
 
     Differences from the paper: it does not say whether the network's memory outlives a window; here
-    it does, for the whole trajectory. Training starts from the fixed parameters (`start=middle`
+    it does, for the whole trajectory. Training starts from calibrated parameters (`start=middle`
     does not): a network that learns little then does little harm.
     """
 

@@ -34,7 +34,7 @@ class RecurrentSettings(PolicySettings):
     )
     start: Literal["fixed", "middle"] = Field(
         "fixed",
-        description="what an untrained network answers: the fixed parameters, or about the middle"
+        description="what an untrained network answers: calibrated parameters, or about the middle"
         " of the bounds (paper)",
     )
     acting_bias: bool = Field(
@@ -84,7 +84,7 @@ class RecurrentNetwork(PolicyNetwork):
     def __init__(
         self, features: int, fixed: Tensor, settings: RecurrentSettings, generator: torch.Generator
     ) -> None:
-        """Takes the networks' fixed parameters in unit space, `(N, n)`."""
+        """Takes what the untrained networks answer in unit space, `(N, n)`."""
         super().__init__()
         networks, parameters = fixed.shape
         self.hidden = settings.hidden_size

@@ -232,7 +232,7 @@ class History(ResultTable):
         Column("amount", "", "the same in words, `10 s` or `80 %`", "text"),
         Column("rmse_speed", "m/s", "RMSE of speed on the test part"),
         Column("rmse_gap", "m", "RMSE of the gap on the test part"),
-        Column("improvement", "1", "over the driver's own fixed parameters"),
+        Column("improvement", "1", "over driver-specific parameters"),
     )
 
     def metrics(self, evaluation: Evaluation) -> dict[str, float]:
@@ -675,14 +675,14 @@ _FEW = 0.1
 """Share of such drivers that is not worth a word; of those learned from it is 0.01 to 0.04."""
 
 _WORSE = 1.1
-"""From this ratio of errors on, the policy is said to be worse than drivers' own parameters."""
+"""From this ratio of errors on, the policy is said to be worse than driver-specific parameters."""
 
 
 class Past(ResultTable):
-    """What each driver's past says of the policy and of their own parameters, and what came of it.
+    """What each driver's past says of the policy and of driver-specific parameters.
 
-    METHOD is `driver_specific`, the driver's own parameters; `alone`, the policy alone; or
-    `policy`, as it was tested: beside the driver's own parameters, if it combines.
+    METHOD is `driver_specific`; `alone`, the policy alone; or `policy`, as it was tested: beside
+    driver-specific parameters, if it combines.
     """
 
     meaning = "what each driver's past says of the policy (`protocol.combine`, `protocol=transfer`)"
@@ -737,14 +737,14 @@ class Past(ResultTable):
         table = evaluation.tables["past"]
         if float(table["share"].min()) < 1:
             yield (
-                "The policy drives beside each driver's own parameters, with a share of"
+                "The policy drives beside driver-specific parameters, with a share of"
                 f" {metrics['past/share']:.2f} on average, as their errors in the driver's past"
                 f" give it; alone its RMSE of speed is {metrics['past/rmse_speed/alone']:.3f} m/s."
             )
         if "past/bound/policy" in metrics:
             yield (
                 f"Expected of {EXPECTED_LEVEL:.0%} of drivers, from their past: RMSE of speed below"
-                f" {metrics['past/bound/policy']:.3f} m/s (own parameters alone"
+                f" {metrics['past/bound/policy']:.3f} m/s (driver-specific parameters alone"
                 f" {metrics['past/bound/driver_specific']:.3f} m/s); so it is for"
                 f" {metrics['past/coverage/policy']:.0%} of them (bound_policy in past.csv)."
             )
@@ -758,14 +758,14 @@ class Past(ResultTable):
         ratio = _ratio(table["past_rmse_speed_alone"], table)
         if ratio > _WORSE:
             yield (
-                f"[yellow]Expect {ratio:.1f} times the error of constant parameters from this"
-                " policy alone: it learned from no drivers like these. Train on recordings like"
-                " this one."
+                f"[yellow]Expect {ratio:.1f} times the error of driver-specific parameters from"
+                " this policy alone: it learned from no drivers like these. Train on recordings"
+                " like this one."
             )
 
 
 def _ratio(error: pd.Series, table: pd.DataFrame) -> float:
-    """Returns the median ratio of an error in the past to that of drivers' own parameters."""
+    """Returns the median ratio of an error in the past to that of driver-specific parameters."""
     own = table["past_rmse_speed_driver_specific"]
     ratio = (error / own.where(own > 0)).dropna()
     return float(ratio.median()) if len(ratio) else math.nan

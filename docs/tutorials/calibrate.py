@@ -77,7 +77,7 @@ for model in ("idm", "krauss"):
 # ## Which model describes them better?
 #
 # Compare errors on the part that was not calibrated on. `default` are the model's default
-# parameters, `pooled` one pooled set for all training drivers, `driver_specific` each driver's own.
+# parameters, `pooled` one set for all training drivers, `driver_specific` one for each driver.
 
 # %%
 table = pd.DataFrame(

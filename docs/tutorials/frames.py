@@ -41,8 +41,8 @@ except cfx.errors.CfxError as error:
 # %% [markdown]
 # ## One model
 #
-# Each driver's own parameters are calibrated on the first 80 % of their trajectory. The weak prior
-# holds a parameter that the recording does not determine near the model's default.
+# Driver-specific parameters are calibrated on the first 80 % of each driver's trajectory. A prior,
+# as strong as predicts them best, holds what the recording does not determine near the default.
 
 # %%
 fit = cfx.calibrate(pairs, "idm", objective="gap_rmse")
@@ -61,7 +61,7 @@ fit.plot().savefig("frames.png")
 # ## Four models
 #
 # Errors on the rest, simulated in closed loop: `default` parameters, one pooled set
-# (`pooled`), each driver's own (`driver_specific`).
+# (`pooled`), one of each driver (`driver_specific`).
 
 # %%
 fits = {"idm": fit}

@@ -38,9 +38,10 @@ result = cfx.run(
 # %% [markdown]
 # ## Against what?
 #
-# For a driver that nobody has recorded there are no own parameters, so the fair baseline is
-# `pooled`: one pooled set, calibrated on the same training drivers, on full trajectories. The
-# interval is over drivers, because frames of one driver say little about the next.
+# For a driver that nobody has recorded there are no driver-specific parameters, so the fair
+# baseline is `pooled`: one pooled set, calibrated on the same training drivers, on full
+# trajectories. The interval is over drivers, because frames of one driver say little about the
+# next.
 
 # %%
 metrics = result.metrics

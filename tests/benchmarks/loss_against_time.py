@@ -1,4 +1,4 @@
-"""The loss that each optimizer reaches within equal times, for fixed parameters and for labels.
+"""The loss that each optimizer reaches within equal times, for driver-specific parameters and for labels.
 
 `python -m tests.benchmarks.loss_against_time --model krauss`: each optimizer runs with one budget of
 evaluations after the other, each from the start, on one core; the best mean loss of all runs that

@@ -114,7 +114,7 @@ def test_answers_as_offsets_begin_at_the_base_of_each_driver() -> None:
 
 
 def test_offsets_are_learned_from_each_drivers_base_and_from_the_pooled_one() -> None:
-    """Labels are the drivers' own parameters: no offset from these, one from the pooled base."""
+    """Labels are driver-specific parameters: no offset from these, one from the pooled base."""
     data = training_data(together=True)
     assert data.pairs.labels is not None
     own = own_bases(data)

@@ -41,7 +41,7 @@ def test_no_answer_leaves_the_bounds(head: ParameterHead) -> None:
 
 
 def test_an_untrained_network_is_what_the_head_starts_from(head: ParameterHead) -> None:
-    """The fixed parameters, or the base; with these being the same, both are it."""
+    """What an untrained head answers, or the base; with these being the same, both are it."""
     fixed = random(3, head.answers)
     unit = head.unit_parameters(head.untrained_answer(fixed), fixed)
     torch.testing.assert_close(unit[:, : head.answers], fixed, rtol=0, atol=1e-12)

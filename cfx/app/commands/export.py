@@ -30,9 +30,9 @@ class ExportCommand(Command):
             "--to",
             metavar="FORMAT",
             required=True,
-            help="sumo (cfx-sumo): fixed parameters, a vType distribution for each cluster"
-            " (.add.xml); onnx (cfx-drivers): the policy with its driving model (.onnx); fmi"
-            " (cfx-drivers): the same as a co-simulation unit of FMI 3.0 (.fmu); netcdf"
+            help="sumo (cfx-sumo): driver-specific parameters, a vType distribution for each"
+            " cluster (.add.xml); onnx (cfx-drivers): the policy with its driving model (.onnx);"
+            " fmi (cfx-drivers): the same as a co-simulation unit of FMI 3.0 (.fmu); netcdf"
             " (cfx-posteriors): draws of each driver's parameters, for ArviZ (.nc);"
             " RUN#NETWORK for one of its networks",
         )

@@ -87,7 +87,8 @@ class Metric(Component):
     Life cycle: a job makes its metrics before any work begins: cfx's own, and those of plugins that
     `metrics` names. It calls `compute` for each method and scope when all methods have been
     simulated; where `is_of_recording`, also for the recording, whose value stands in
-    `metrics.json` as `NAME/real` and in `pairs.csv` as `real_NAME`. A metric has no settings, so that its name means the same number in every job.
+    `metrics.json` as `NAME/real` and in `pairs.csv` as `real_NAME`. A metric has no settings, so
+    that its name means the same number in every job.
 
     Attributes:
         unit: of the number, "" for a ratio.

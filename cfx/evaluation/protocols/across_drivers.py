@@ -55,7 +55,7 @@ class AcrossDriversSettings(Settings):
     base: Literal["driver_specific", "pooled", "default"] = Field(
         "driver_specific",
         description="what a policy of offsets starts from for drivers with history:"
-        " driver_specific: their own parameters; pooled: the pooled ones; default: the model's; for"
+        " driver_specific, pooled or default parameters; for"
         " drivers without history: the pooled ones, or the model's",
     )
     shrinkage: float = Field(
@@ -74,7 +74,7 @@ class AcrossDriversSettings(Settings):
     )
     combine: bool = Field(
         False,
-        description="the driver's own parameters drive beside the policy in the test part, each"
+        description="driver-specific parameters drive beside the policy in the test part, each"
         " with the share that their errors in the driver's past give it; needs history: null",
     )
     histories: Distinct[tuple[Annotated[float, Field(ge=0)], ...]] = Field(
@@ -86,7 +86,7 @@ class AcrossDriversSettings(Settings):
     def _past_is_known(self) -> Self:
         if self.combine and self.history is not None:
             raise ValueError(
-                "combine: the driver's own parameters are calibrated on all of their past; leave"
+                "combine: driver-specific parameters are calibrated on all of their past; leave"
                 " history: null, or set combine: false"
             )
         return self
@@ -157,7 +157,7 @@ class AcrossDrivers(Protocol):
 
     The drivers are divided into k folds. For each fold a network is trained, and one parameter set,
     `pooled`, is calibrated jointly, on the full trajectories of all other drivers. Then
-    default, pooled, `driver_specific` (the driver's own set, calibrated on the first 80 % of the
+    default, pooled, `driver_specific` (calibrated on the first 80 % of the driver's
     trajectory) and the policy are simulated over the last 20 % of each test trajectory. The policy
     observes the measured first part before (burn-in) and learns nothing from it. Default,
     pooled and policy are also simulated over each full test trajectory, from its first frame.
@@ -171,9 +171,9 @@ class AcrossDrivers(Protocol):
     into one fold, where even that cannot happen. `together=recording` asks the harder question:
     whether what was learned holds on another day, road or data set.
 
-    Differences from the paper: the paper's baseline is `pooled`; the driver's
-    own set is the stronger one. The paper does not say how folds are drawn; here a shuffle that
-    `seed` determines draws them.
+    Differences from the paper: the paper's baseline is `pooled`; `driver_specific` is the stronger
+    one. The paper does not say how folds are drawn; here a shuffle that `seed` determines draws
+    them.
     """
 
     schema: ClassVar[type[Settings]] = AcrossDriversSettings

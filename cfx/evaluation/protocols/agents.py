@@ -66,7 +66,8 @@ class AgentBuilder:
     def untrained(self, policy: Policy, parameters: Tensor) -> TrainingResult:
         """Returns a policy's networks as built; see `constant`.
 
-        They are in double precision, so that constants stay what calibration found.
+        They are in double precision, so that constant parameters stay what calibration
+        found.
         """
         space = self.stepper.model.space
         width = token_width(policy.inputs, policy.summary, self.windows.length)

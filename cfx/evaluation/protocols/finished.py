@@ -69,7 +69,7 @@ class FinishedPolicy:
         }
 
     def tested(self, context: ProtocolContext) -> Trained:
-        """Returns the test of all drivers of a recording; only their own sets are calibrated.
+        """Returns the test of all drivers of a recording; driver-specific sets are calibrated.
 
         Raises:
             DataError: the policy has learned from some of the pairs, or drives in other steps.

@@ -61,12 +61,12 @@ class HeldOut:
 
     @property
     def combines(self) -> bool:
-        """Whether the drivers' own parameters drive beside the policy in the test part."""
+        """Whether driver-specific parameters drive beside the policy in the test part."""
         return self.policy.context_rule.combines
 
     @cached_property
     def past(self) -> PastErrors:
-        """What the drivers' pasts say of the policy and of their own parameters."""
+        """What the drivers' pasts say of the policy and of driver-specific parameters."""
         unknown = Followers(self.batch, self.network, self.unseen_base)
         return past_errors(self.context, self.policy, self.pairs, unknown, self.first)
 

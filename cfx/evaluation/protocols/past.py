@@ -1,18 +1,18 @@
-"""What drivers' pasts say of a policy and of the drivers' own parameters.
+"""What drivers' pasts say of a policy and of driver-specific parameters.
 
-The past of each driver, up to the test part, is split once more. On the first 60 % of it the
-driver's own parameters are calibrated, and the policy observes it; the rest is simulated with each
-of the two, and neither has seen it. Of the errors of speed e_own(t) and e_policy(t) there follows
-the policy's share where both drive together (`cfx.models.composed`): that of the mean which errs
-least, and not far from a half,
+The past of each driver, up to the test part, is split once more. On the first 60 % of it
+driver-specific parameters are calibrated, and the policy observes it; the rest is simulated with
+each of the two, and neither has seen it. Of the errors of speed e_own(t) and e_policy(t) there
+follows the policy's share where both drive together (`cfx.models.composed`): that of the mean which
+errs least, and not far from a half,
 
     minimise over w   sum (w e_policy + (1 - w) e_own)^2 + S (w - 1/2)^2
 
 with S the mean of the two sums of squares. Without correlation that lies between a half and the
 weight of J. M. Bates and C. W. J. Granger (1969); C. W. J. Granger and R. Ramanathan (1984),
 *Improved methods of combining forecasts*, J. Forecasting 3(2), have the regression, whose weights
-vary much where the past is short, so it is shrunk here. In the test, own parameters are those
-calibrated on all of the past.
+vary much where the past is short, so it is shrunk here. In the test, driver-specific parameters are
+those calibrated on all of the past.
 
 Shapes: D drivers, K + 1 frames, n tuned parameters.
 """
@@ -38,7 +38,7 @@ from cfx.policies.context import ExpectedError, conformal_bound
 from cfx.policies.known_drivers import base_of
 
 EARLIER = 0.6
-"""Share of the past on which own parameters are calibrated, to be tested on the rest."""
+"""Share of the past on which driver-specific sets are calibrated, to be tested on the rest."""
 
 SHORTEST_S = 3.0
 """s: a past of which either part is shorter says nothing."""
@@ -80,7 +80,7 @@ class PastErrors:
         return np.sqrt(np.maximum(both, 0.0))
 
     def together_with(self, values: Tensor) -> OwnParameters:
-        """Returns the own parameters that drive beside the policy.
+        """Returns the driver-specific parameters that drive beside the policy.
 
         Args:
             values: calibrated on all of the past, `(D, n)`, SI units.
@@ -95,7 +95,7 @@ def past_errors(
     followers: Followers,
     first: Tensor,
 ) -> PastErrors:
-    """Simulates the last part of D drivers' pasts with the policy and with their own parameters.
+    """Simulates the last part of D drivers' pasts with the policy and with driver-specific sets.
 
     Args:
         context: what the protocol composes.

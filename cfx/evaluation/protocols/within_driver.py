@@ -37,11 +37,11 @@ class WithinDriverSettings(Settings):
 class WithinDriver(Protocol):
     """The paper's first experiment, on each driver alone.
 
-    The first 80 % of each pair's windows serve to calibrate and train, the last 20 % to test. The
-    fixed parameters come from one closed-loop simulation of the training part. The test starts from
-    the last measured state of the training part. No frame of the test part is read before the
-    evaluation. With `split=1` constant parameters are calibrated on whole trajectories, and errors
-    are those of the same trajectories.
+    The first 80 % of each pair's windows serve to calibrate and train, the last 20 % to test.
+    Driver-specific parameters come from one closed-loop simulation of the training part. The test
+    starts from the last measured state of the training part. No frame of the test part is read
+    before the evaluation. With `split=1` constant parameters are calibrated on whole trajectories,
+    and errors are those of the same trajectories.
     """
 
     schema: ClassVar[type[Settings]] = WithinDriverSettings

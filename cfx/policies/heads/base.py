@@ -131,7 +131,7 @@ class ParameterHead(ABC):
         """Returns the answers with which untrained networks start.
 
         Args:
-            fixed: each network's fixed parameters in unit space, `(N, n)`.
+            fixed: each network's base parameters in unit space, `(N, n)`.
 
         Returns:
             `(N, n)` in [0, 1], what `Policy.build` takes as `fixed`.

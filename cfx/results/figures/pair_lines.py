@@ -515,7 +515,7 @@ def chosen_pairs(
     by_id = {trajectory.pair_id: trajectory for trajectory in result.trajectories}
     is_calibration = "policy" not in result.shown_methods
     judged = "policy"
-    if is_calibration:  # the drivers' own constant set, which stands last, if there is one
+    if is_calibration:  # driver-specific parameters, which stand last, if there are any
         judged = [method for method in result.shown_methods if method not in canvas.HIDDEN][-1]
     rows = result.pairs[result.pairs["method"] == judged]
     rows = rows[rows["pair_id"].isin(list(by_id))]

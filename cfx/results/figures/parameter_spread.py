@@ -228,7 +228,7 @@ class Calibration(JobFigure):
 
     title = "Calibrated parameters of all drivers, and their rank correlations"
     caption = (
-        "Each driver's own parameters (a dot per pair), calibrated on the first part of their"
+        "Driver-specific parameters (a dot per pair), calibrated on the first part of their"
         " trajectory; pooled and default parameters beside them. Where values gather at a bound, or"
         " spread over the whole range, these recordings may hardly determine the parameter."
     )

@@ -255,7 +255,7 @@ def has_a_constant_baseline_as_claimed(model: DrivingModel) -> None:
     reacts = (near - far).abs().gt(1e-6).double().mean().item()
     assert reacts >= 0.1, (
         "the model claims `has_constant_baseline`, but takes notice of its leader in"
-        f" {reacts:.0%} of ordinary states: fixed parameters would"
+        f" {reacts:.0%} of ordinary states: constant parameters would"
         " be no baseline (set `has_constant_baseline = False` for a model whose parameters are"
         " the control itself)"
     )

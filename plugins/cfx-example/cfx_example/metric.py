@@ -1,7 +1,7 @@
 """A metric: what is measured of each simulated pair. This one is the mean time gap.
 
-The evaluation calls `compute` for each method (default, fixed, policy), with the trajectories of
-many pairs at once; tables, figures and MLflow show the numbers.
+The evaluation calls `compute` for each method (default, driver_specific, policy), with the
+trajectories of many pairs at once; tables, figures and MLflow show the numbers.
 """
 
 from __future__ import annotations

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 
 class LinearMap(Policy):
-    """Answers the fixed parameters until it is trained; has no memory."""
+    """Answers calibrated parameters until it is trained; has no memory."""
 
     def build(
         self, features: int, default: Tensor, fixed: Tensor, generator: torch.Generator
@@ -23,11 +23,11 @@ class LinearMap(Policy):
 class LinearNetwork(PolicyNetwork):
     """N linear maps from f features to n parameters: sigmoid(w x + b).
 
-    At first w is zero and b stands for the fixed parameters.
+    At first w is zero and b stands for the calibrated parameters.
     """
 
     def __init__(self, features: int, fixed: Tensor) -> None:
-        """Takes fixed parameters `(N, n)` in unit space."""
+        """Takes calibrated parameters `(N, n)` in unit space."""
         super().__init__()
         networks, parameters = fixed.shape
         self.weight = nn.Parameter(fixed.new_zeros((networks, features, parameters)))

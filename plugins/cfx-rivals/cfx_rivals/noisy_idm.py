@@ -1,10 +1,10 @@
 """IDM with noise that remembers: what it leaves unexplained goes on for seconds.
 
-IDM's pooled constants are calibrated as cfx does; what measured accelerations differ from them, in
+IDM's pooled parameters are calibrated as cfx does; what measured accelerations differ from them, in
 steps of half a second, is a Gaussian process in time whose next value depends on the last ones. The
 two rivals differ in how they say that dependence.
 
-Differences from the papers: constants and noise are found one after the other, not by one Bayesian
+Differences from the papers: parameters and noise are found one after the other, not by one Bayesian
 inference, and are the same for all drivers.
 
 Shapes: P pairs, p remembered steps. SI units.
@@ -52,7 +52,7 @@ class NoisyIdmSettings(Settings):
     """Settings of IDM with noise."""
 
     remembered: int = Field(5, ge=1, le=40, description="residuals that the next one depends on")
-    optimizer: str = Field("shade", description="of cfx, which finds the constants")
+    optimizer: str = Field("shade", description="of cfx, which finds the pooled parameters")
 
 
 class NoisyIdm(Rival):
@@ -141,8 +141,8 @@ def _covariances(pairs: PairSet, idm: _Idm, remembered: int) -> Floats:
     """Returns the covariances of what IDM leaves unexplained, at lags 0, 1, ..., p.
 
     Correlations are means over sites. Their variance is that of the site in the middle: where
-    drivers keep far smaller gaps than the pooled constants, residuals are offsets of several m/s2,
-    and one such site would make the noise of all.
+    drivers keep far smaller gaps than with pooled parameters, residuals are offsets of several
+    m/s2, and one such site would make the noise of all.
     """
     batch = PairBatch.of(pairs)
     every = round(STEP_S / batch.dt)
@@ -176,7 +176,7 @@ class NoisyIdmDriver(StepDriver):
     residual is what happened less what IDM wanted: of the measured past it is the driver's own.
 
     Args:
-        idm: with constants.
+        idm: with pooled parameters.
         noise: of the residuals.
         dt: time step, s.
     """

@@ -42,7 +42,7 @@ _WITHOUT_LAG = {"variant": "sumo", "leader_deceleration": None}
 
 
 class VTypeExport(ExportFormat):
-    """Writes a job's fixed parameters as vTypes that SUMO loads: see `export`."""
+    """Writes driver-specific parameters as vTypes that SUMO loads: see `export`."""
 
     def write(self, run: str, output: Path | None) -> list[str]:
         return export(run, output)

@@ -89,10 +89,10 @@ def test_each_fold_counts_once_and_few_drivers_bound_nothing() -> None:
 def test_larger_errors_than_those_of_constants_are_warned_of() -> None:
     assert ExpectedError(policy=2.0, own=2.0).of_unseen_in_words() == ""
     better = ExpectedError(unseen=1.2, unseen_constant=1.5).of_unseen_in_words()
-    assert "below 1.20 m/s (constant parameters: 1.50 m/s)" in better
+    assert "below 1.20 m/s (pooled over the other drivers: 1.50 m/s)" in better
     assert "expect" not in better
     worse = ExpectedError(unseen=3.0, unseen_constant=1.5).of_unseen_in_words()
-    assert "expect 2.0 times the error of constant parameters: train" in worse
+    assert "expect 2.0 times the error of pooled parameters: train" in worse
 
 
 def test_bounds_know_nothing_of_the_driver_that_they_are_for() -> None:

@@ -65,7 +65,7 @@ def unseen(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def known(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A job whose policy starts from drivers' own parameters, and has a residual."""
+    """A job whose policy starts from driver-specific parameters, and has a residual."""
     own = ["protocol.shrinkage=0.3", "learner.head=residual"]
     return trained(tmp_path_factory.mktemp("jobs") / "known", *ROLLOUT, *own)
 

@@ -42,7 +42,7 @@ class TcnSettings(PolicySettings):
     )
     start: Literal["fixed", "middle"] = Field(
         "fixed",
-        description="what an untrained network answers: the fixed parameters, or about the middle"
+        description="what an untrained network answers: calibrated parameters, or about the middle"
         " of the bounds",
     )
 
@@ -144,7 +144,7 @@ class TcnNetwork(PolicyNetwork):
     def __init__(
         self, features: int, fixed: Tensor, settings: TcnSettings, generator: torch.Generator
     ) -> None:
-        """Takes the networks' fixed parameters in unit space, `(N, n)`."""
+        """Takes what the untrained networks answer in unit space, `(N, n)`."""
         super().__init__()
         networks, parameters = fixed.shape
         s, channels = settings, settings.channels
@@ -197,7 +197,7 @@ class TcnPolicy(Policy):
 
     Differences from the paper: no weight normalisation (it speeds up long trainings; these take
     seconds); weights are drawn as PyTorch draws those of a convolution; a sigmoid keeps the answers
-    within the parameters' bounds; training starts from the fixed parameters (`start=middle` does
+    within the parameters' bounds; training starts from calibrated parameters (`start=middle` does
     not).
     """
 

@@ -63,8 +63,8 @@ class BenchmarkCommand(Command):
             "--output",
             type=Path,
             metavar="FOLDER",
-            help="of the row; default: outputs/benchmark/NAME, of roads outputs/benchmark/roads-1/NAME;"
-            " of roads the baseline's row and the recordings lie beside it",
+            help="of the row; default: outputs/benchmark/NAME, of roads"
+            " outputs/benchmark/roads-1/NAME; of roads the baseline's row and the recordings lie beside it",
         )
         made.add_argument(
             "--submission",

@@ -14,7 +14,7 @@ from cfx.plugin import registry
 from cfx_report.benchmark.rival import Rival
 
 _CONSTANTS = ("idm", "gipps", "ovm", "fvdm", "newell", "w99", "krauss")
-"""Models whose constants are pooled by the global optimizer (`optimizer=shade`, the default)."""
+"""Models whose pooled parameters the global optimizer finds (`optimizer=shade`, the default)."""
 
 _POLICIES = (("model=idm", "--method", "closed_loop"), ("model=krauss", "--method", "closed_loop"))
 

@@ -262,7 +262,7 @@ class AgentDriver(Driver):
         return on_frames(driven.speed, batch, first)
 
     def adapted(self, past: PairSet, seed: int) -> Driver:
-        """Calibrates each driver's own constants on their past, where they drive or are a base."""
+        """Calibrates driver-specific parameters on their past, where they drive or are a base."""
         if not (self._is_constant or self.agent.context_rule.driver_specific):
             return self
         fit = cfx.calibrate(past, split=1.0, seed=seed, **self._settings)

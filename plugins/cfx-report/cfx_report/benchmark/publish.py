@@ -386,7 +386,7 @@ def card_text(card: dict[str, Any], measured: dict[str, Any] | None = None) -> s
         f" {errors['rmse_gap']:.2f} m; {errors['improvement_over_pooled']:+.1%} over pooled"
         f" parameters (95 % interval {low:+.1%} to {high:+.1%})",
         f"- **Last 20 %**: RMSE of speed {errors['last_part_rmse_speed']:.3f} m/s,"
-        f" {errors['last_part_improvement_over_own']:+.1%} over the drivers' own parameters",
+        f" {errors['last_part_improvement_over_own']:+.1%} over driver-specific parameters",
         f"- **Safety in these tests**: {safety['collisions']:.0f} collisions,"
         f" {safety['hard_braking_frames']:.0f} frames braking harder than 8 m/s2, RMS jerk"
         f" {safety['jerk']:.2f} m/s3 (the recorded drivers: {safety['jerk_of_people']:.2f})",
@@ -438,8 +438,8 @@ def _site_lines(rows: Sequence[dict[str, Any]]) -> list[str]:
     if not rows:
         return []
     lines = [
-        "| left out | drivers | last 20 %: own / policy, m/s | over own | full trajectories: pooled"
-        " / policy, m/s | over pooled |",
+        "| left out | drivers | last 20 %: driver-specific / policy, m/s | over driver-specific"
+        " | full trajectories: pooled / policy, m/s | over pooled |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
     full = {

@@ -52,7 +52,7 @@ SPLITS = {
         metrics=("rmse_gap", "rmse_speed"),
         rows=(
             ("IDM, segment-based", (3.177, 0.606)),
-            ("cfx, IDM constants", (3.341, 0.618)),
+            ("cfx, IDM, pooled", (3.341, 0.618)),
             ("cfx, policy with Krauss", (2.82, 0.588)),
         ),
         note="whole trajectories, means over pairs",
@@ -66,7 +66,7 @@ SPLITS = {
             ("LSTM, theirs", (7.58,)),
             ("network, theirs", (8.47,)),
             ("IDM, theirs", (17.65,)),
-            ("cfx, IDM constants", (7.47,)),
+            ("cfx, IDM, pooled", (7.47,)),
             ("cfx://idm", (5.91,)),
         ),
         note="MSE of speed plus MSE of the gap, each over all frames of an event",

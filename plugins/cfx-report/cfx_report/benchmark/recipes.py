@@ -63,7 +63,8 @@ RECIPES = {
     "idm-history": Recipe(
         ("experiment=every_road", "protocol.histories=[]"),
         "Intelligent Driver Model for people and cars with adaptive cruise control on any road,"
-        " with history: it observes a driver, then drives as they do, beside their own parameters.",
+        " with history: it observes a driver, then drives as they do, beside driver-specific"
+        " parameters.",
         EVERY_ROAD,
     ),
     "idm-stochastic": Recipe(

@@ -139,7 +139,7 @@ upper reference for the models that follow.</p>
         return {
             "adapts": adapts,
             "numbers": f"The numbers are {whose}",
-            "ranked": " ".join([_RANKED, *comparison_of(jobs).sentences()]),
+            "ranked": _RANKED,
             "closeness": closeness(jobs),
             "unconditional": job_names(of_purpose(jobs, Purpose.POLICY)),
             "errors": absolute(jobs),
