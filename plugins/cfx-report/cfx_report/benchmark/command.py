@@ -64,7 +64,7 @@ class BenchmarkCommand(Command):
             type=Path,
             metavar="FOLDER",
             help="of the row; default: outputs/benchmark/NAME, of roads"
-            " outputs/benchmark/roads-1/NAME; of roads the baseline's row and the recordings lie beside it",
+            " outputs/benchmark/roads-1/NAME, where the baseline's row and the recordings lie too",
         )
         made.add_argument(
             "--submission",
