@@ -254,8 +254,10 @@ _NEAR_M = 0.5
 """m: room to brake in counts as this at least."""
 
 _TIGHT_M = 1.0
-"""m: gap below which no residual makes a vehicle faster than its leader. It is not wider: drivers
-in congestion follow closely."""
+"""m: gap below which a vehicle accelerates no more than its model wants. It is not wider: drivers
+in congestion follow closely. Relative speed does not matter: behind a standing leader whose
+measured speed is 0.01 m/s a residual of 0.3 m/s2 in every second step closed the last 10 cm within
+20 s, until the gap was negative (four cars with ACC of ZalaZone)."""
 
 _BRAKES_IN_FULL_MPS = 5.0
 """m/s: speed from which a residual brakes in full. Up to it the weight rises with the square of the
@@ -274,10 +276,10 @@ class WithResidual(Composed):
     the start (s).
 
     Neither the acceleration at the start nor a residual keeps a vehicle from braking. Where the gap
-    is below 1 m and does not grow, the vehicle accelerates no more than the model wants; and where
-    a deceleration of more than 2 m/s2 is needed to reach the leader's speed within the gap,
-    b = (v - v_l)^2 / (2 s), it brakes at least as hard as that, or as hard as the model wants if
-    that is less.
+    is below 1 m, the vehicle accelerates no more than the model wants, so that a residual brings it
+    no closer to its leader than the model does; and where a deceleration of more than 2 m/s2 is
+    needed to reach the leader's speed within the gap, b = (v - v_l)^2 / (2 s), it brakes at least
+    as hard as that, or as hard as the model wants if that is less.
 
     Nor does a residual hold a queue that the model lets move. A residual says by how much a moving
     driver's acceleration differs from the model's, and at a standstill there is none to differ. So
@@ -351,14 +353,12 @@ def _residual_at(follower: Follower) -> Tensor:
 
 def _braked(both: Tensor, alone: Tensor, follower: Follower, leader: Leader) -> Tensor:
     """Returns `both`, that of model and residual, with all braking that is needed, m/s2."""
-    no_more = torch.minimum(both, alone)
     gap = bumper_gap(follower, leader)
-    difference = follower.speed - leader.speed
-    closing = difference.clamp(min=0.0)
+    closing = (follower.speed - leader.speed).clamp(min=0.0)
     needed = closing.square() / (2.0 * gap.clamp(min=_NEAR_M))
     most = torch.maximum(alone, -needed)
     bounded = torch.where(needed > _HARD, torch.minimum(both, most), both)
-    return torch.where((gap < _TIGHT_M) & (difference >= 0.0), no_more, bounded)
+    return torch.where(gap < _TIGHT_M, torch.minimum(both, alone), bounded)
 
 
 SPEED_LIMIT = "speed_limit"

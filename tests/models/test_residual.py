@@ -132,6 +132,20 @@ def test_no_residual_keeps_a_vehicle_from_braking_for_its_leader() -> None:
     assert float(speed[100:].max()) < 1.0
 
 
+def test_no_residual_closes_the_last_metre_behind_a_leader_who_only_seems_to_move() -> None:
+    """A standing leader whose measured speed is noise: the vehicle stays where the model stands."""
+    steps = 600
+    still = torch.zeros((steps, 1)).double()
+    noise = 0.01 + 0.01 * torch.rand((steps, 1), generator=torch.Generator().manual_seed(0))
+    leader = Leader(still + 5.15, noise.double(), still, torch.tensor(5.0).double())
+    wrapped = WithResidual(IDM())
+    p = wrapped.space.unpack(wrapped.space.defaults()) | {"s0": torch.tensor(0.2).double()}
+    p["residual_target"] = torch.tensor(0.5).double()
+    stepper = MemoryStepper(wrapped, DT)
+    _, position, _ = stepper.advance(stepper.begin(start(0.0, 0.0)), leader, p)
+    assert float(position.max()) == 0.0, "at 0.15 m, within s0, IDM alone stands"
+
+
 @pytest.mark.parametrize("model", [Krauss(), IDM(), W99()], ids=["krauss", "idm", "w99"])
 def test_no_residual_holds_a_queue_that_the_model_lets_move(model: DrivingModel) -> None:
     """At rest, 12 m behind a leader who crawls: a queue moves on as it does without a residual."""

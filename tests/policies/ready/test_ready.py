@@ -53,8 +53,8 @@ def test_each_card_says_what_a_user_must_know(name: str) -> None:
     card = ready.card_of(name)
     assert card["errors_on_unseen_drivers"]["rmse_speed"] < 0.9
     assert card["errors_on_unseen_drivers"]["improvement_over_pooled"] > 0
-    # Full trajectories of unseen drivers have no guard, which SUMO's step has.
-    assert card["safety"]["collisions"] <= {"krauss": 7, "idm-acc": 4}.get(name, 0)
+    # Full trajectories of unseen drivers, which have no guard as SUMO's step has.
+    assert card["safety"]["collisions"] == 0
     # Krauss's acceleration jumps from step to step, and more so on fast roads; its card says so.
     assert card["safety"]["jerk"] < (2.0 if name == "krauss" else 1.5)
     kinds = {event["kind"]: event for event in card["stress"]["events"]}
