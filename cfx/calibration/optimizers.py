@@ -211,6 +211,15 @@ class Optimizer(Component):
         """
         return self
 
+    def with_effort(self, times: float, n: int) -> Optimizer:
+        """Returns the optimizer for parameters that are harder to find; itself by default.
+
+        Args:
+            times: how many times the usual evaluations they take (`DrivingModel.search_effort`).
+            n: number of parameters.
+        """
+        return self
+
     def of_pooled(self) -> Optimizer:
         """Returns the optimizer of pooled parameters; that of labels by default.
 

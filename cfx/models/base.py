@@ -96,6 +96,9 @@ class DrivingModel(Component):
         has_constant_baseline: with constant parameters the model reacts to its leader. A model
             without that has parameters that are the control itself. Constant ones are then no
             baseline, and reports do not compare with them. Tested.
+        search_effort: how many times the usual evaluations a search for its parameters takes. Above
+            1 for a model whose losses have narrow valleys or jumps, so that searches of the usual
+            length end above the optimum (`python -m tests.benchmarks.optimum` says so).
         needs_simulator: name of the simulator that alone can drive the model; "" for a model with
             equations in Python, which every simulator that uses them can drive. Where it is given,
             `next_speed` raises a ConfigError.
@@ -113,6 +116,7 @@ class DrivingModel(Component):
     differentiable: ClassVar[bool] = True
     collision_free: ClassVar[bool] = False
     has_constant_baseline: ClassVar[bool] = True
+    search_effort: ClassVar[float] = 1.0
     needs_simulator: ClassVar[str] = ""
     reference: ClassVar[str] = ""
     temperature: Temperature = 0.0

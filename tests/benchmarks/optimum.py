@@ -135,8 +135,9 @@ def reference(losses: SegmentLosses, model: str | None = None) -> list[float]:
 
 def minimized(name: str, losses: SegmentLosses, seed: int) -> tuple[Solution, float]:
     """Returns what an optimizer of cfx finds from the default on, and its CPU seconds."""
-    optimizer = cast("Optimizer", registry.create("optimizer", {"name": name}))
-    space = losses.stepper.model.space
+    usual = cast("Optimizer", registry.create("optimizer", {"name": name}))
+    model, space = losses.stepper.model, losses.stepper.model.space
+    optimizer = usual.with_effort(model.search_effort, len(space))
     default: Tensor = space.to_unit(space.defaults()).double()
     began = time.process_time()
     solution = optimizer.minimize(losses, default.expand(losses.problems, 1, -1), seed=seed)

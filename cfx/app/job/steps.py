@@ -323,7 +323,9 @@ def compose(
             workspace = cache_folder / "training"
     solver = Solver(
         components.simulator.stepper(components.model, batch.dt),
-        components.optimizer,
+        components.optimizer.with_effort(
+            components.model.search_effort, len(components.model.space)
+        ),
         config.seed,
         objective=components.objective,
         memory=bound,

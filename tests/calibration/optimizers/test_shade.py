@@ -106,3 +106,24 @@ def test_populations_search_pooled_parameters_where_that_is_asked() -> None:
     optimizer = ShadeSearch(pooled_samples=20_000).of_pooled()
     assert isinstance(optimizer, ShadeSearch)
     assert optimizer.settings.samples == 20_000
+
+
+def test_agreement_of_small_populations_does_not_end_a_thorough_search() -> None:
+    # A wide basin on which small populations agree, beside a narrow one that is lower.
+    def hidden(x: Tensor, at: Tensor) -> Tensor:
+        wide = 1.0 + (x - 0.8).square().sum(-1)
+        narrow = 0.5 + 200.0 * (x - 0.1).square().sum(-1)
+        return torch.minimum(wide, narrow)
+
+    problems, guesses = Problems(hidden, random(1, 3)), random(1, 1, 3)
+    usual = ShadeSearch()
+    assert float(usual.minimize(problems, guesses, seed=0).loss) == pytest.approx(1.0)
+    thorough = usual.with_effort(3.0, 3)
+    assert thorough.evaluations(3) <= 3 * usual.evaluations(3)
+    assert float(thorough.minimize(problems, guesses, seed=0).loss) == pytest.approx(0.5, abs=1e-5)
+
+
+def test_what_a_user_asks_for_overrides_the_models_effort() -> None:
+    asked = ShadeSearch(samples=8000)
+    assert asked.with_effort(3.0, 5) is asked
+    assert ShadeSearch().with_effort(1.0, 5).evaluations(5) == ShadeSearch().evaluations(5)

@@ -68,6 +68,7 @@ class GippsDelay(DrivingModel):
     settings: GippsDelaySettings
     reference = "Gipps (1981), Transp. Res. B 15(2); Wilson (2001), IMA J. Appl. Math. 66(5)"
     collision_free = True
+    search_effort = 2.0
     parameters = _parameters()
 
     def __init__(self, settings: Settings | None = None, **options: object) -> None:

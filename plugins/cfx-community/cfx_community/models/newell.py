@@ -44,6 +44,7 @@ class Newell(DrivingModel):
     """
 
     reference = "Newell (2002), Transp. Res. B 36(3)"
+    search_effort = 3.0
     parameters = ParameterSpace.of(
         Parameter("tau", "s", 0.3, 10.0, 1.4, "time by which the path is shifted", _SOURCE),
         Parameter(

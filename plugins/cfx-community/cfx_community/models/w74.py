@@ -85,6 +85,7 @@ class W74(DrivingModel):
         " meddelande 960A"
     )
     collision_free: ClassVar[bool] = True
+    search_effort: ClassVar[float] = 3.0
 
     parameters = ParameterSpace.of(
         Parameter("ax_add", "m", 0.5, 10.0, 2.0, "gap at standstill", _VISSIM),
