@@ -49,6 +49,7 @@ MEASURED_OTHERWISE = {
     "docs/speed.md": "tests/benchmarks, named on the page",
     "docs/sumo.md": "benchmarks of plugins/cfx-sumo, named on the page",
     "docs/traffic.md": "`cfx drive stress`, `experiment=traffic`",
+    "docs/tried.md": "trainings with the settings beside its tables",
 }
 """Documents, or folders of them, whose other figures have another source, and which."""
 
