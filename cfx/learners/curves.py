@@ -8,10 +8,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-__all__ = []
-"""What plugins may use, as `cfx.plugin.curves`."""
-
-
 log = logging.getLogger(__name__)
 
 _TYPES = {"network": str, "epoch": "int64", "train_loss": float, "validation_loss": float}
