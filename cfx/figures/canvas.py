@@ -48,6 +48,7 @@ __all__ = [
     "on_paper",
     "percent_axis",
     "percent_tick",
+    "plain_tick",
     "points",
     "side_by_side",
     "styled",

@@ -87,7 +87,9 @@ def everything() -> Result:
         "fan": fits.assign(time_s=1.0, calibrated_on=False, signal="speed", measured=1.0, **FAN),
         "labels": labels.assign(**{f"parameter_{axis.name}": 1.0}),
     }
-    return dataclasses.replace(results, tables={**results.tables, **tables})
+    prior = {"weight": 0.2, "pairs": 3, "held_out_error": {"0.01": 0.7, "0.3": 0.6, "1": 0.65}}
+    data = {**results.data, "priors": [prior]}
+    return dataclasses.replace(results, tables={**results.tables, **tables}, data=data)
 
 
 OWN = [
