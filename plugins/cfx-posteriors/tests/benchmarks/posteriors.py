@@ -40,7 +40,7 @@ from cfx.simulation.trajectory import Segments
 from cfx_posteriors.density import DEVIATION, Posterior
 from cfx_posteriors.importance import DRAWS, Sampled, sample
 from cfx_posteriors.intervals import LaplaceMethod, posterior_of
-from cfx_posteriors.laplace import laplace, likely_starts
+from cfx_posteriors.laplace import Normal, laplace, likely_starts
 from cfx_posteriors.neural import Learned, learn
 from cfx_posteriors.noise import RATE, SHAPE
 from cfx_posteriors.nuts import CHAINS, Chains, effective_samples, walk
@@ -504,14 +504,16 @@ def forecasts(name: str) -> Iterator[str]:
     alone = posterior_of(solver, batch, known, settings, NOISE)
     starts = likely_starts(alone, seed=0)
     normal = laplace(alone, starts)
-    _, within, pooled = fit_population(alone, normal)
+
+    def sampled(posterior: Posterior, normal: Normal) -> Tensor:
+        return sample(posterior, normal, SHARES, seed=0, memory=1 << 30).draws
+
+    _, within, pooled = fit_population(alone, normal, sampled)
     drawn = {
         "likeliest": normal.mode[:, None].expand(-1, DRAWS, -1),
-        "posterior": sample(alone, normal, SHARES, seed=0, memory=1 << 30).draws,
+        "posterior": sampled(alone, normal),
         "likeliest within the population": pooled.mode[:, None].expand(-1, DRAWS, -1),
-        "posterior within the population": sample(
-            within, pooled, SHARES, seed=0, memory=1 << 30
-        ).draws,
+        "posterior within the population": sampled(within, pooled),
     }
     whole = posterior_of(solver, batch, last, settings, NOISE)
     for label, draws in drawn.items():
