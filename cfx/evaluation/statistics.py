@@ -409,7 +409,7 @@ def verdict(ranking: Ranking) -> str:
     elif ahead == others:
         text += ", significantly"
     else:
-        text += f", but significantly than {ahead} of {others} others alone"
+        text += f", but significantly closer than only {ahead} of {others} others"
     interval = "one driver"
     if math.isfinite(improvement.ci95_low):
         interval = f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"

@@ -208,3 +208,12 @@ def test_one_driver_gives_no_significance() -> None:
     said = verdict(ranking_of(tables))
     assert said.startswith("Closest to the drivers: job 0, but not significantly")
     assert "p =" not in said
+
+
+def test_a_verdict_says_how_many_of_the_others_are_significantly_worse() -> None:
+    noise = 0.05 * np.random.default_rng(0).standard_normal((2, 40))
+    alike, worse = noise[0] + 1e-4, noise[1] + 0.5
+    said = verdict(ranking_of(jobs(np.zeros(40), alike - alike.mean() + 1e-4, worse)))
+    assert said.startswith(
+        "Closest to the drivers: job 0, but significantly closer than only 1 of 2 others; over"
+    )
