@@ -134,7 +134,7 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
         heading = re.sub(r"(?<!of) ", "\n", metric.heading)
         table.add_column(escape(f"{heading}{unit}"), justify="right")
         if metric.name in fitted:
-            table.add_column("where\nfitted", justify="right")
+            table.add_column("fitted\npart", justify="right")
     baselines = result.baselines(scope) if with_improvement else ()
     if baselines:
         table.add_column(
