@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 from cfx.evaluation.metrics.base import RMSE_SPEED, MetricInfo, key_of
@@ -203,13 +203,14 @@ def _error_said(heading: str, unit: str, measured: Mapping[str, float], baseline
             for method in _CONSTANT:
                 if measured.get(method, math.inf) < measured[baseline]:
                     beside.append(method)
-            sets = [f"{_CONSTANT[method]} {measured[method]:.3f}{unit}" for method in beside]
-            text += f" ({', '.join(sets)})"
+            text += f" ({_constant_sets(measured, beside, unit)})"
         return text
-    sets = []
-    for method, error in measured.items():
-        sets.append(f"{_CONSTANT[method]} {error:.3f}{unit}")
-    return f"{heading} {', '.join(sets)}"
+    return f"{heading} {_constant_sets(measured, measured, unit)}"
+
+
+def _constant_sets(measured: Mapping[str, float], methods: Iterable[str], unit: str) -> str:
+    """Returns the errors of sets of constant parameters in words."""
+    return ", ".join(f"{_CONSTANT[method]} {measured[method]:.3f}{unit}" for method in methods)
 
 
 def fitted_errors(errors: Mapping[str, float]) -> dict[str, float]:

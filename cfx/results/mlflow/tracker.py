@@ -297,7 +297,6 @@ class MlflowTracker(Tracker):
         self.log_files(sorted(folder.iterdir()), "policy")
         with (
             translate_errors("log the policy as a model"),
-            _requirements_unchecked(),
             tempfile.TemporaryDirectory() as temporary,
         ):
             import mlflow
@@ -444,28 +443,6 @@ def _dataset_name(name: str, source: str) -> str:
     if source.startswith(name):
         return source[:_DATASET_NAME]
     return f"{name}: {source}"[:_DATASET_NAME]
-
-
-@contextmanager
-def _requirements_unchecked() -> Iterator[None]:
-    """Keeps MLflow from comparing a model's requirements with what is installed.
-
-    Ours are what is installed, and the warning would not be shown. For the comparison MLflow reads
-    the list of files of every distribution: a second of each job that trains.
-    """
-    from mlflow.utils import environment as of_mlflow
-
-    environment: Any = of_mlflow  # it is not in MLflow's interface
-    compare = environment.warn_dependency_requirement_mismatches
-    environment.warn_dependency_requirement_mismatches = _nothing
-    try:
-        yield
-    finally:
-        environment.warn_dependency_requirement_mismatches = compare
-
-
-def _nothing(requirements: list[str]) -> None:
-    """Compares nothing."""
 
 
 def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:

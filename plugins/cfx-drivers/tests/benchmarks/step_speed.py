@@ -63,9 +63,10 @@ def in_onnx(file: Path, drivers: int) -> float:
     options.intra_op_num_threads = options.inter_op_num_threads = 1
     session = onnxruntime.InferenceSession(str(file), options)
     inputs = {}
-    for one in session.get_inputs():
-        kind = {"tensor(int64)": np.int64, "tensor(float)": np.float32}.get(one.type, np.float64)
-        inputs[one.name] = np.zeros((drivers, *one.shape[1:]), kind)
+    kinds = {"tensor(int64)": np.int64, "tensor(float)": np.float32}
+    for signal in session.get_inputs():
+        kind = kinds.get(signal.type, np.float64)
+        inputs[signal.name] = np.zeros((drivers, *signal.shape[1:]), kind)
     for name, value in (("ego_speed", 15.0), ("leader_speed", 15.0), ("gap", 30.0)):
         inputs[name][:] = value
     return least(lambda: session.run(None, inputs), 100)
@@ -82,10 +83,10 @@ def in_fmi(file: Path, folder: Path) -> float:
         instanceName="driver",
     )
     unit.instantiate()
-    numbers = {one.name: one.valueReference for one in description.modelVariables}
+    numbers = {signal.name: signal.valueReference for signal in description.modelVariables}
     unit.enterInitializationMode()
-    wanted = [numbers[name] for name in ("ego_speed", "leader_speed", "gap")]
-    unit.setFloat64(wanted, [15.0, 15.0, 30.0])
+    signals = [numbers[name] for name in ("ego_speed", "leader_speed", "gap")]
+    unit.setFloat64(signals, [15.0, 15.0, 30.0])
     unit.exitInitializationMode()
     now = 0.0
 
