@@ -75,11 +75,11 @@ class LaggedRival(Rival):
         Levine 2019, *Causal confusion in imitation learning*). So training drivers who were left
         out are driven, and say what it may see.
         """
-        learned, kept = _divided(pairs, seed)
+        learned, kept = divided(pairs, seed)
         errors = {}
         for lags in LAGS_S:
             driver = LaggedDriver(self._follower(learned, lags, seed), [], lags, pairs.dt)
-            errors[lags] = _error(driver, kept)
+            errors[lags] = mean_error(driver, kept)
         chosen = min(LAGS_S, key=lambda lags: errors[lags])
         follower = self._follower(pairs, chosen, seed)
         return LaggedDriver(follower, self._ends(pairs, seed), chosen, pairs.dt)
@@ -152,7 +152,7 @@ class LaggedDriver(StepDriver):
             knots.append(np.maximum(speed + change, 0.0))
         frames = torch.arange(batch.mask.shape[1])
         time = (frames - first[:, None]).clamp(min=0).numpy() * batch.dt
-        return torch.as_tensor(_between(np.stack(knots, 1), (0.0, *HORIZONS_S), time))[None]
+        return torch.as_tensor(between(np.stack(knots, 1), (0.0, *HORIZONS_S), time))[None]
 
 
 class RidgeRival(LaggedRival):
@@ -254,7 +254,7 @@ def _drawn(pairs: PairSet, moments: int, seed: int) -> list[NDArray[np.int64]]:
     return drawn
 
 
-def _divided(pairs: PairSet, seed: int) -> tuple[PairSet, PairSet]:
+def divided(pairs: PairSet, seed: int) -> tuple[PairSet, PairSet]:
     """Divides pairs by driver into those that are learned from, and those that are driven."""
     drivers = np.array(sorted(set(pairs.drivers)), dtype=object)
     count = max(1, round(_VALIDATED * len(drivers)))
@@ -265,7 +265,7 @@ def _divided(pairs: PairSet, seed: int) -> tuple[PairSet, PairSet]:
     return (learned, kept) if len(learned) else (pairs, pairs)
 
 
-def _error(driver: StepDriver, pairs: PairSet) -> float:
+def mean_error(driver: Driver, pairs: PairSet) -> float:
     """Returns the mean RMSE of speed over full trajectories."""
     batch = PairBatch.of(pairs)
     speed = driver.drive(batch, torch.zeros(len(batch), dtype=torch.int64), None)
@@ -328,7 +328,7 @@ def _future_of_each(
     return np.stack(columns, 1)
 
 
-def _between(knots: Floats, times: Sequence[float], at: Floats) -> Floats:
+def between(knots: Floats, times: Sequence[float], at: Floats) -> Floats:
     """Interpolates `(P, K)` values at K times linearly, at times `(P, T)`."""
     place = np.clip(np.searchsorted(times, at, side="right"), 1, len(times) - 1)
     grid = np.asarray(times)

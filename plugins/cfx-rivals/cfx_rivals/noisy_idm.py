@@ -170,7 +170,7 @@ def _covariances(pairs: PairSet, idm: _Idm, remembered: int) -> Floats:
 
 
 class NoisyIdmDriver(StepDriver):
-    """Drives by IDM, and with noise where chance is drawn.
+    """Drives by IDM with noise; where nothing is drawn, with the mean of the noise to come.
 
     The memory holds what IDM wanted the last time, and the last residuals, the latest first. A
     residual is what happened less what IDM wanted: of the measured past it is the driver's own.
@@ -204,8 +204,9 @@ class NoisyIdmDriver(StepDriver):
             seen.follower_speed[:, -1], seen.leader_speed[:, -1], seen.gap[:, -1]
         )
         following = torch.cat([wanted[:, None], residuals], 1)
-        if generator is None:
-            return wanted, following
-        draws = torch.randn(len(wanted), generator=generator, dtype=torch.float64)
-        noise = residuals @ self._weights + self._noise.deviation * draws
+        # What is known of the past goes on and fades, also where nothing is drawn: it is the mean.
+        noise = residuals @ self._weights
+        if generator is not None:
+            draws = torch.randn(len(wanted), generator=generator, dtype=torch.float64)
+            noise = noise + self._noise.deviation * draws
         return wanted + noise, following

@@ -25,6 +25,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "physics_informed": {"steps": 20, "hidden_size": 8},
     "ar_idm": {"remembered": 2, "optimizer": "random"},
     "ma_idm": {"remembered": 2, "optimizer": "random"},
+    "stacked": {"members": ["ridge", "constant_acceleration"], "similar": 20},
 }
 NAMES = [entry.name for entry in registry.entries("rival") if entry.distribution == "cfx-rivals"]
 
@@ -80,5 +81,5 @@ def test_sites_are_learned_from_evenly() -> None:
 def test_a_regression_drives_with_the_lags_that_drive_best(monkeypatch: pytest.MonkeyPatch) -> None:
     rival = made("ridge")
     assert isinstance(rival, LaggedRival)
-    monkeypatch.setattr("cfx_rivals.lagged._error", lambda driver, _: -driver.lags)
+    monkeypatch.setattr("cfx_rivals.lagged.mean_error", lambda driver, _: -driver.lags)
     assert tried(rival).driver.lags == 21  # type: ignore[attr-defined]

@@ -263,8 +263,8 @@ HEADINGS = {
     "collisions": "pairs with a collision",
     "hard_braking": "braking frames",
     "flow_error": "flow wrong by",
-    "train_s": "learning [s]",
-    "drive_s": "driving [s]",
+    "train_s": "learning [CPU s]",
+    "drive_s": "driving [CPU s]",
 }
 
 

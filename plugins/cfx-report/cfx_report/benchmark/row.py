@@ -35,10 +35,10 @@ class Row:
         data: what the pairs are.
         command: which gives the row again.
         cfx: version of cfx.
-        seconds: that the job took, beside whatever else ran.
+        seconds: CPU time of learning and driving, s.
         pairs, drivers: that were tested.
         values: by metric, or by task and metric: value, low, high; counts have no interval.
-        parts: the seconds that learning (`train`) and driving (`drive`) took.
+        parts: the CPU time of learning (`train`) and of driving (`drive`), s.
         flows: by which share flows behind leaders of constant speed are wrong
             (`cfx_report.benchmark.equilibrium`), in the mean over folds.
         card: who, paper, licence and what was learned from, of a submission.
