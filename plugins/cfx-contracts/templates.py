@@ -13,8 +13,8 @@ from pathlib import Path
 
 EXAMPLE = Path(__file__).parent.parent / "cfx-example"
 TEMPLATES = Path(__file__).parent / "cfx_contracts" / "template"
-WITHOUT_TEMPLATE = {"section", "rival"}
-"""Kinds of other distributions: `cfx plugins new` knows cfx's own."""
+WITHOUT_TEMPLATE = {"section"}
+"""Kinds whose components hold what the template language would take for its own."""
 
 
 def components() -> Iterator[tuple[str, str, str]]:

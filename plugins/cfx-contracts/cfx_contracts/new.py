@@ -145,6 +145,7 @@ def _words(kind: registry.Kind, name: str) -> dict[str, Any]:
         "api": API_VERSION,
         "requires": requires,
         "contracts": requires.replace(OWN, "cfx-contracts"),
+        "report": requires.replace(OWN, "cfx-report"),  # whose benchmark has rivals
     }
 
 
@@ -155,6 +156,8 @@ def _usage(kind: registry.Kind, name: str) -> str:
         arguments = f"{kind.group}{'' if kind.name == 'metric' else 's'}=[own,{name}]"
     if kind.name == "input":
         arguments = f"policy.inputs=[situation,{name}]"
+    if kind.name == "rival":
+        arguments = f"benchmark --suite roads --quick rival={name} --data FOLDER"
     if kind.name == "dataset":
         arguments += " data.path=FILE.csv"
     if kind.name == "command":

@@ -12,8 +12,8 @@ from cfx_report.benchmark.rival import Driver, Rival, Seen, StepDriver
 from pydantic import Field
 
 
-class TimeGapSettings(Settings):
-    """Settings of `time_gap`."""
+class MeanTimeGapSettings(Settings):
+    """Settings of `mean_time_gap`."""
 
     reaction_s: float = Field(2.0, gt=0, description="s in which an error of the gap is driven out")
 
@@ -22,8 +22,8 @@ class MeanTimeGap(Rival):
     """Keeps 2 m and the mean time gap of the drivers that it has learned from."""
 
     reference = "this file"
-    schema = TimeGapSettings
-    settings: TimeGapSettings
+    schema = MeanTimeGapSettings
+    settings: MeanTimeGapSettings
 
     def fit(self, pairs: PairSet, seed: int) -> Driver:
         batch = PairBatch.of(pairs)  # tensors `(P, T)`; `mask` says which frames there are

@@ -11,7 +11,9 @@ from cfx_example.rival import MeanTimeGap
 
 
 def test_cfx_finds_it():
-    assert cfx.get("rival", "time_gap") is MeanTimeGap, "install it first: pip install --editable ."
+    assert cfx.get("rival", "mean_time_gap") is MeanTimeGap, (
+        "install it first: pip install --editable ."
+    )
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)

@@ -6,6 +6,8 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
+import pandas as pd
+
 from cfx.errors import DataError
 from cfx_report.benchmark import predictions
 from cfx_report.benchmark.row import Row
@@ -36,25 +38,26 @@ def score_submission(
         DataError: a file or the card is wrong, in one sentence with row and column.
     """
     about = read_card(card)
-    tables = {}
+    tables: dict[str, tuple[Path, pd.DataFrame]] = {}
     for path in paths:
         table = predictions.read(path)
         kind = predictions.FORECASTS if "horizon_s" in table else predictions.TRAJECTORIES
         if kind in tables:
             raise DataError(f"{path}: is the second file of {kind.partition('.')[0]}; give one")
-        tables[kind] = table
-    folder.mkdir(parents=True, exist_ok=True)
-    for kind, table in tables.items():
-        predictions.write(table, folder / kind)
-    return write_row(
+        tables[kind] = (path, table)
+    row = write_row(
         recordings,
         folder,
+        tables,
         name=name,
         command=f"cfx benchmark --suite {recordings.suite.name} --submission",
         seconds={},
         flows={},
         card=about,
     )
+    for kind, (_, table) in tables.items():
+        predictions.write(table, folder / kind)
+    return row
 
 
 def read_card(path: Path) -> dict[str, str]:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -105,12 +105,16 @@ def make_row(entry: Entry, recordings: Recordings, folder: Path, seed: int) -> R
         training = Training(suite, scheme, recordings.pairs, fold, recording, folder, seed)
         for number in range(training.folds):
             timings.append(_fold(entry, training, number))
-    _join(folder)
+    tables = {}
+    for kind, table in _joined(folder).items():
+        predictions.write(table, folder / kind)
+        tables[kind] = (folder / kind, predictions.read(folder / kind))
     made = pd.DataFrame([timing["seconds"] for timing in timings]).sum()
     flow = pd.DataFrame([timing["flows"] for timing in timings]).mean()
     return write_row(
         recordings,
         folder,
+        tables,
         name=entry.name,
         command=command_of(suite, entry.words),
         seconds={str(name): float(value) for name, value in made.items()},
@@ -121,6 +125,7 @@ def make_row(entry: Entry, recordings: Recordings, folder: Path, seed: int) -> R
 def write_row(
     recordings: Recordings,
     folder: Path,
+    tables: Mapping[str, tuple[Path, pd.DataFrame]],
     *,
     name: str,
     command: str,
@@ -128,16 +133,27 @@ def write_row(
     flows: dict[str, float],
     card: dict[str, str] | None = None,
 ) -> Row:
-    """Scores the predictions that lie in a folder, and writes its row."""
+    """Scores predictions, and writes their row.
+
+    Args:
+        recordings: of the suite.
+        folder: of the row; nothing is written there where a prediction is wrong.
+        tables: trajectories and forecasts by their kind, each with the file that it was read from.
+        name, command, seconds, flows, card: as of `Row`.
+
+    Raises:
+        DataError: a prediction is missing or wrong, in one sentence with file, row and column.
+    """
     suite, tested = recordings.suite, recordings.suite.tested(recordings.pairs)
     parts, drives = [], None
-    for file in (predictions.TRAJECTORIES, predictions.FORECASTS):
-        if (folder / file).is_file():
-            table = predictions.read(folder / file)
-            parts.append(errors_of(suite, tested, table, str(folder / file)))
-            if file == predictions.TRAJECTORIES:
+    for kind in (predictions.TRAJECTORIES, predictions.FORECASTS):
+        if kind in tables:
+            source, table = tables[kind]
+            parts.append(errors_of(suite, tested, table, str(source)))
+            if kind == predictions.TRAJECTORIES:
                 drives = _drives(suite, tested, table, parts[-1])
     errors = pd.concat(parts, ignore_index=True)
+    folder.mkdir(parents=True, exist_ok=True)
     if drives is not None:
         predictions.write(drives, folder / DRIVES)
     errors.insert(0, "protocol", recordings.protocol)
@@ -271,12 +287,11 @@ def _drive(driver: Driver, training: Training, number: int, task: Task, place: P
     predictions.write(table, place / f"{task.name}.parquet")
 
 
-def _join(folder: Path) -> None:
-    """Writes the trajectories and the forecasts of all folds as one file each."""
+def _joined(folder: Path) -> dict[str, pd.DataFrame]:
+    """Returns the trajectories and the forecasts of all folds, by their kind."""
     parts: dict[str, list[pd.DataFrame]] = {}
     for path in sorted((folder / "folds").glob("*/*.parquet")):
         table = pd.read_parquet(path)
         name = predictions.FORECASTS if "horizon_s" in table else predictions.TRAJECTORIES
         parts.setdefault(name, []).append(table)
-    for name, tables in parts.items():
-        predictions.write(pd.concat(tables, ignore_index=True), folder / name)
+    return {kind: pd.concat(tables, ignore_index=True) for kind, tables in parts.items()}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -286,6 +287,16 @@ def test_a_card_says_everything(recordings: Recordings, rows: list[Path], tmp_pa
         score_submission(
             [rows[0] / TRAJECTORIES], card(tmp_path, licence=" "), recordings, tmp_path, "x"
         )
+
+
+def test_a_wrong_submission_is_named_and_leaves_nothing(
+    recordings: Recordings, rows: list[Path], tmp_path: Path
+) -> None:
+    mine = tmp_path / "mine.parquet"
+    pd.read_parquet(rows[0] / TRAJECTORIES).iloc[1:].to_parquet(mine)
+    with pytest.raises(DataError, match=re.escape(f"{mine}, column")):
+        score_submission([mine], card(tmp_path), recordings, tmp_path / "row", "x")
+    assert not (tmp_path / "row").exists()
 
 
 def test_scores_are_relative_to_the_baseline(rows: list[Path]) -> None:
