@@ -406,6 +406,87 @@ def benchmark() -> list[str]:
     return table(head, rows)
 
 
+def standing(task: str) -> dict[str, Any]:
+    """Returns how the rows of the suite `roads` stand in a task."""
+    path = ROOT / "docs" / "benchmark_roads.json"
+    tasks: dict[str, dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["tasks"]
+    return tasks[task]
+
+
+def scores() -> list[str]:
+    """Returns the scores of the rows of `roads` in each task, the best on new roads first."""
+    tasks = ("new_road", "same_road", "known", "forecast")
+    by_task = {}
+    for task in tasks:
+        by_task[task] = {line["row"]: line for line in standing(task)["rows"]}
+    rows = []
+    for name, line in by_task["new_road"].items():
+        cells = [name]
+        for task in tasks:
+            of_task = by_task[task].get(name)
+            if name == "idm, constant" or of_task is None:
+                cells.append("")
+                continue
+            score, low, high = [100 * of_task[key] for key in ("score", "low", "high")]
+            cells.append(f"{score:+.0f} % ({low:+.0f} to {high:+.0f})")
+        cells.append(f"{100 * line['flow_error']:.0f} %")
+        cells.append(f"{line['train_s'] / 60:.1f}, {line['drive_s'] / 60:.1f}")
+        rows.append(cells)
+    head = ("row", *[f"`{task}`" for task in tasks], "flow wrong by", "CPU minutes")
+    return table(head, rows)
+
+
+def driving() -> list[str]:
+    """Returns errors, over sites, and collisions of the rows of `roads`."""
+    tasks = ("new_road", "same_road", "known")
+    head, by_task = ["row"], {}
+    for task in tasks:
+        by_task[task] = {line["row"]: line for line in standing(task)["rows"]}
+        head += [f"`{task}`: speed", "gap", "collisions"]
+    rows = []
+    for name in by_task["new_road"]:
+        cells = [name]
+        for task in tasks:
+            line = by_task[task][name]
+            cells.append(number(line["rmse_speed"], "rmse_speed"))
+            cells.append(number(line["rmse_gap"], "rmse_gap"))
+            cells.append(number(line["collisions"], "collisions"))
+        rows.append(cells)
+    return table(head, rows)
+
+
+def horizons(metric: str) -> list[str]:
+    """Returns a metric of forecasts of the rows of `roads` at each horizon."""
+    seconds = ("0.5", "1", "2", "3", "5", "10")
+    rows = []
+    for line in standing("forecast")["rows"]:
+        values = [line[f"{metric} {horizon} s"] for horizon in seconds]
+        if metric == "coverage":
+            if None not in values:
+                rows.append([line["row"], *[f"{100 * value:.0f} %" for value in values]])
+        else:
+            rows.append([line["row"], *[f"{value:.3f}" for value in values]])
+    return table(("row", *[f"{horizon} s" for horizon in seconds]), rows)
+
+
+def by_site(task: str) -> list[str]:
+    """Returns the error by which a task is judged at each site."""
+    of_rows = standing(task)["sites"]
+    rows = []
+    for name, errors_of_row in of_rows.items():
+        rows.append([name, *[f"{error:.3f}" for error in errors_of_row.values()]])
+    return table(("row", *next(iter(of_rows.values()))), rows)
+
+
+def verdicts() -> list[str]:
+    """Returns the verdict of each task of `roads`."""
+    lines = []
+    for task in ("new_road", "same_road", "known", "forecast"):
+        verdict = standing(task)["verdict"]
+        lines.append(f"- `{task}`: {verdict[0].lower()}{verdict[1:]}")
+    return lines
+
+
 def card(name: str) -> dict[str, Any]:
     """Returns the card of a ready-made policy."""
     found: dict[str, Any] = json.loads((READY_FOLDER / name / "card.json").read_text("utf-8"))
@@ -586,6 +667,11 @@ TABLES: dict[str, Callable[..., list[str]]] = {
     "traffic": traffic,
     "stress": stress,
     "lights": lights,
+    "scores": scores,
+    "driving": driving,
+    "horizons": horizons,
+    "by_site": by_site,
+    "verdicts": verdicts,
 }
 
 

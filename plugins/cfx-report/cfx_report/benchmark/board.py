@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import Any
 import pandas as pd
 
 from cfx.errors import DataError
-from cfx.plugin import statistics
+from cfx.plugin import files, statistics
 from cfx_report.benchmark.compare import read_errors
 from cfx_report.benchmark.entries import folder_of
 from cfx_report.benchmark.i80 import I80
@@ -226,6 +227,28 @@ def _costs(row: Row) -> dict[str, object]:
     }
 
 
+def write_standings(rows: Sequence[Entered], path: Path) -> None:
+    """Writes how rows stand in each task as JSON, also what the printed tables leave out.
+
+    Raises:
+        DataError: the suite has no tasks to stand in: its rows are `benchmark_pairs.csv` already.
+        OutputError: the file cannot be written.
+    """
+    suite = suite_of(rows)
+    if suite.name == "i80":
+        raise DataError(f"--json writes the tasks of a suite; {suite.name} has one table alone")
+    tasks = {}
+    for standing in standings(rows):
+        # pandas writes NaN, which JSON has not, as null.
+        tasks[standing.task.name] = {
+            "rows": json.loads(standing.table.to_json(orient="records", double_precision=6)),
+            "sites": json.loads(standing.sites.to_json(orient="index", double_precision=6)),
+            "verdict": standing.verdict,
+        }
+    commands = {entered.row.name: entered.row.command for entered in rows}
+    files.write_json(path, {"protocol": suite.protocol, "commands": commands, "tasks": tasks})
+
+
 def markdown(standing: Standing) -> list[str]:
     """Returns a task's table as Markdown, and its verdict."""
     return [
@@ -269,7 +292,7 @@ HEADINGS = {
 
 
 def is_shown(standing: Standing, column: str) -> bool:
-    """Says whether a column has a place: RMSE and coverage of forecasts are in the CSV alone."""
+    """Says whether a column has a place: RMSE and coverage of forecasts are in the data alone."""
     if column.startswith(("coverage", "rmse_speed ")):
         return False
     return bool(standing.table[column].notna().any())

@@ -207,13 +207,19 @@ class TableCommand(Command):
         made.add_argument(
             "--page", type=Path, metavar="FILE", help="write the leaderboard as one HTML file"
         )
+        made.add_argument(
+            "--json", type=Path, metavar="FILE", help="write what is printed, and more, as data"
+        )
         return made
 
     def run(self, options: argparse.Namespace) -> int:
-        from cfx_report.benchmark.board import Entered, lines_of_rows
+        from cfx_report.benchmark.board import Entered, lines_of_rows, write_standings
 
         rows = [Entered.read(place) for place in options.rows]
         print("\n".join(lines_of_rows(rows)))
+        if options.json is not None:
+            write_standings(rows, options.json)
+            print(f"\nAs data: {options.json}")
         if options.page is not None:
             from cfx_report.benchmark.leaderboard import write_page
 

@@ -14,9 +14,13 @@ from cfx.plugin import registry
 from cfx_report.benchmark.rival import Rival
 
 _CONSTANTS = ("idm", "gipps", "ovm", "fvdm", "newell", "w99", "krauss")
-"""Models whose pooled parameters the global optimizer finds (`optimizer=shade`, the default)."""
+"""Models whose parameters are pooled over all drivers, by the default search."""
 
-_POLICIES = (("model=idm", "--method", "closed_loop"), ("model=krauss", "--method", "closed_loop"))
+_POLICIES = (
+    ("model=idm", "--method", "closed_loop"),
+    ("model=krauss", "--method", "closed_loop"),
+    ("experiment=every_road", "learner.ensemble_size=1"),
+)
 
 _SEEDS = (0, 1)
 """Of rows that are trained: one seed says too little."""
