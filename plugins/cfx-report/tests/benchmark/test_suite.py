@@ -18,7 +18,7 @@ from cfx.app.cli import main
 from cfx.errors import CfxError, ConfigError, DataError
 from cfx.plugin import PairBatch, PairSet
 from cfx_report.benchmark import opencf, published, watching
-from cfx_report.benchmark.board import Entered, lines_of_rows, standings
+from cfx_report.benchmark.board import Entered, lines_of_rows, standings, write_standings
 from cfx_report.benchmark.entries import entry_of
 from cfx_report.benchmark.everything import commands
 from cfx_report.benchmark.leaderboard import render
@@ -311,6 +311,20 @@ def test_scores_are_relative_to_the_baseline(rows: list[Path]) -> None:
     assert "Closest to the drivers:" in text
     with pytest.raises(DataError, match="scores are relative to the row 'keeps'"):
         standings(entered[1:])
+
+
+def test_standings_are_written_with_what_tables_leave_out(rows: list[Path], tmp_path: Path) -> None:
+    entered = [Entered.read(folder) for folder in rows]
+    write_standings(entered, tmp_path / "rows.json")
+    written = json.loads((tmp_path / "rows.json").read_text(encoding="utf-8"))
+    assert set(written["commands"]) == {"keeps", "late"}
+    for standing in standings(entered):
+        lines = written["tasks"][standing.task.name]["rows"]
+        assert [line["row"] for line in lines] == standing.table["row"].tolist()
+        scores = [line["score"] for line in lines]
+        np.testing.assert_allclose(scores, standing.table["score"], atol=1e-6)
+    left_out = [name for name in written["tasks"]["forecast"]["rows"][0] if "coverage" in name]
+    assert len(left_out) == len(SMALL.horizons)
 
 
 def test_the_page_is_one_file_with_drives(rows: list[Path]) -> None:
