@@ -346,10 +346,11 @@ def _interrupted(signalled: BaseException) -> int:
 def _preset_behind(status: JobStatus, values: Mapping[str, Any]) -> str:
     """Returns, to go after a message about a key, the preset that set it; "" if none did."""
     key = re.match(r"\w+(\.\w+)+", status.message)
-    if key is None or any(
-        override.lstrip("+").startswith(f"{key[0]}=") for override in status.overrides
-    ):
+    if key is None:
         return ""
+    for override in status.overrides:
+        if override.lstrip("+").startswith(f"{key[0]}="):  # the user did
+            return ""
     group = key[0].partition(".")[0]
     choice, node = HydraConfig.get().runtime.choices.get(group), values.get(group)
     if not isinstance(choice, str) or not isinstance(node, Mapping) or node.get("name") == choice:

@@ -108,7 +108,10 @@ class ComponentSearchPath(SearchPathPlugin):
         own = Path(hydra.__file__).parent / "conf"
         for package, folder in plugin_conf_dirs().items():
             names = {path.relative_to(folder).as_posix() for path in folder.rglob("*.yaml")}
-            replaced = [name for name in sorted(names) if name in in_code or (own / name).is_file()]
+            replaced = []
+            for name in sorted(names):
+                if name in in_code or (own / name).is_file():
+                    replaced.append(name)
             if replaced:
                 log.warning(
                     "The plugin %s brings %s, which would replace Hydra's own; its folder %s is"
@@ -127,7 +130,10 @@ def plugin_conf_dirs() -> dict[str, Path]:
 
     Runs no code of theirs.
     """
-    packages = {entry.package for kind in registry.KINDS for entry in registry.entries(kind)}
+    packages = set()
+    for kind in registry.KINDS:
+        for entry in registry.entries(kind):
+            packages.add(entry.package)
     folders: dict[str, Path] = {}
     for package in sorted(packages - {"cfx"}):
         with suppress(ImportError, ValueError):  # a broken distribution harms nobody else

@@ -75,8 +75,7 @@ def overrides_of(config: JobConfig) -> tuple[str, ...]:
         if node is not None and (group == "model" or not is_usual):
             chosen.append(f"{group}={node.get('name')}")
     usual = _composed(chosen)
-    for key in ("preset", *[key for key in values if values[key] == usual.get(key)]):
-        values.pop(key, None)
+    values.pop("preset")
     chosen += _differences("", values, usual)
     return tuple(chosen)
 

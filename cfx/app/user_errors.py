@@ -118,8 +118,11 @@ def _unreadable(error: OverrideParseException) -> str:
 
 def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     """Returns a sentence with the keys that there are where `key` was looked for."""
-    written = [one for one in overrides if re.match(rf"\+*{re.escape(key)}\b", one)]
-    given = written[0] if written else key
+    given, of_key = key, re.compile(rf"\+*{re.escape(key)}\b")
+    for override in overrides:
+        if of_key.match(override):
+            given = override
+            break
     others = [override for override in overrides if override != given]
     try:
         config: Any = hydra_source.composed(others)

@@ -581,7 +581,10 @@ def _quantities(pairs: PairSet) -> Iterator[tuple[str, Floats]]:
 
 
 def _counts(counts: Sequence[Dropped]) -> list[str]:
-    return [f"  {dropped.count:,} {dropped.unit}: {dropped.reason}" for dropped in counts]
+    lines = []
+    for dropped in counts:
+        lines.append(f"  {dropped.count:,} {dropped.unit}: {dropped.reason}")
+    return lines
 
 
 def _suspicions(contents: Contents, check: Check, units: Mapping[str, str]) -> Iterator[str]:

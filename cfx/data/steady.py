@@ -193,8 +193,11 @@ def relation_from(table: Mapping[str, Sequence[float]]) -> GapRelation:
     Raises:
         KeyError: a column is missing.
     """
-    speed, gap, low, median, high = (
-        np.asarray(table[name], dtype=np.float64) for name in GapRelation._fields[:-1]
+    return GapRelation(
+        speed=np.asarray(table["speed"], dtype=np.float64),
+        gap=np.asarray(table["gap"], dtype=np.float64),
+        low=np.asarray(table["low"], dtype=np.float64),
+        median=np.asarray(table["median"], dtype=np.float64),
+        high=np.asarray(table["high"], dtype=np.float64),
+        drivers=np.asarray(table["drivers"], dtype=np.int64),
     )
-    drivers = np.asarray(table["drivers"], dtype=np.int64)
-    return GapRelation(speed, gap, low, median, high, drivers)

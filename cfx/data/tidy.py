@@ -623,7 +623,10 @@ def _as_table(
         if name in optional:
             columns[name] = per_pair(of_each(pairs, attribute), pa.string())
     for name in truths:
-        values = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
+        values = []
+        for pair in pairs:
+            unknown = np.full(len(pair), np.nan)
+            values.append(pair.truth.get(name, unknown))
         columns[TRUE + name] = _over_time(values)
     for signal in signals:
         columns[signal.column] = _over_time([pair.surroundings[signal] for pair in pairs])

@@ -59,10 +59,10 @@ class Comparison:
             jobs: by name; several of one name, which differ in the seed alone, count as one: their
                 errors are averaged.
         """
-        every: list[Result] = []
+        objectives: list[tuple[MetricInfo, str]] = []
         for alike in jobs.values():
-            every += alike
-        objectives = [(job.judge, objective_of(job.judge, job.data)) for job in every]
+            for job in alike:
+                objectives.append((job.judge, objective_of(job.judge, job.data)))
         judge = common_judge(objectives)
         errors: dict[str, list[pd.DataFrame]] = {}
         for name, alike in jobs.items():

@@ -298,11 +298,12 @@ class KnownParameters:
         fits = evaluation.tables.get("fits")
         if fits is None or "noise_scale" not in fits:
             return None
-        tuned = tuple(
-            parameter for parameter in evaluation.parameters if f"median_{parameter.name}" in fits
-        )
+        tuned = []
+        for parameter in evaluation.parameters:
+            if f"median_{parameter.name}" in fits:
+                tuned.append(parameter)
         evidence = noise_evidence(evaluation.tables)
-        return cls(fits[fits["method"] == "driver_specific"], tuned, evidence)
+        return cls(fits[fits["method"] == "driver_specific"], tuple(tuned), evidence)
 
     @property
     def reliable(self) -> pd.Series:
@@ -351,17 +352,15 @@ class KnownParameters:
         table.add_column("determined for", justify="right")
         open_ones = []
         for parameter in self.parameters:
-            ends = (
-                float(self.rows[f"{end}_{parameter.name}"].median())
-                for end in ("median", "low", "high")
-            )
-            middle, low, high = ends
+            name = parameter.name
+            columns = [f"median_{name}", f"low_{name}", f"high_{name}"]
+            middle, low, high = self.rows[columns].median()
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             interval = f"{middle:.3g}{unit} ({low:.3g} to {high:.3g})"
-            determined = self.determined(parameter.name)
-            table.add_row(parameter.name, interval, f"{determined} of {pairs}")
+            determined = self.determined(name)
+            table.add_row(name, interval, f"{determined} of {pairs}")
             if determined < self.reliable.sum():
-                open_ones.append(f"{parameter.name} for {self.reliable.sum() - determined}")
+                open_ones.append(f"{name} for {self.reliable.sum() - determined}")
         sentences = self._doubts()
         if open_ones:
             sentences.append(

@@ -527,10 +527,13 @@ def chosen_pairs(
         values = gains.to_numpy(dtype=float)
         if is_calibration:
             values = -rows[result.judge.name].to_numpy(dtype=float)
-        ranked = rank_pairs(list(gains.index), values, count)
-        if is_calibration:
-            ranked = tuple(RankedPair(pair.pair_id, pair.rank, math.nan) for pair in ranked)
-        return [(pair, by_id[pair.pair_id]) for pair in ranked]
+        best_and_worst = []
+        for pair in rank_pairs(list(gains.index), values, count):
+            # A calibration alone has nothing to be better than.
+            improvement = math.nan if is_calibration else pair.improvement
+            ranked = RankedPair(pair.pair_id, pair.rank, improvement)
+            best_and_worst.append((ranked, by_id[pair.pair_id]))
+        return best_and_worst
     wanted = [pair_id] if isinstance(pair_id, str) else list(pair_id)
     chosen = []
     for name in wanted:
@@ -544,8 +547,12 @@ def chosen_pairs(
 def _errors(result: Result, pair_id: str, signal: str) -> dict[str, float]:
     """Returns the RMSE of a signal of one pair by method, in the methods' order."""
     rows = result.pairs[result.pairs["pair_id"] == pair_id].drop_duplicates("method")
-    errors = rows.set_index("method")[f"rmse_{signal}"]
-    return {method: float(errors[method]) for method in result.shown_methods if method in errors}
+    by_method = rows.set_index("method")[f"rmse_{signal}"]
+    errors = {}
+    for method in result.shown_methods:
+        if method in by_method:
+            errors[method] = float(by_method[method])
+    return errors
 
 
 def _errors_text(result: Result, pair_id: str, signal: str, unit: str) -> str:

@@ -534,13 +534,12 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
 
     client = store.client
     same = f"tags.`cfx.app.job` = '{tags['cfx.app.job']}' and attributes.status != 'FINISHED'"
-    left = [
-        run
-        for run in client.search_runs([store.experiment_id], same, max_results=10)
-        if not _is_running(run)
-    ]
-    if left:
-        run, logged = left[0], left[0].data.params
+    unfinished = []
+    for run in client.search_runs([store.experiment_id], same, max_results=10):
+        if not _is_running(run):
+            unfinished.append(run)
+    if unfinished:
+        run, logged = unfinished[0], unfinished[0].data.params
         client.update_run(run.info.run_id, status="RUNNING", name=name)
         if "cfx.failure" in run.data.tags:
             client.delete_tag(run.info.run_id, "cfx.failure")
