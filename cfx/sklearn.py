@@ -104,8 +104,8 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         table = frame_of_any(X, "X")
         # Those of calibration, such as the optimizer's, do nothing where nobody calibrates.
         settings = self.settings or {}
-        kept = [key for key in settings if key.startswith(("model.", "data."))]
-        of_model = {key: settings[key] for key in kept}
+        keys = [key for key in settings if key.startswith(("model.", "data."))]
+        of_model = {key: settings[key] for key in keys}
         drive = simulate(self.model, self.parameters_, _pairs(table), **of_model)
         order = row_order(table)
         speed = np.empty(len(order))

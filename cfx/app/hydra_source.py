@@ -105,12 +105,12 @@ class ComponentSearchPath(SearchPathPlugin):
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         # A file of such a name on the search path would replace Hydra's own.
         in_code = {f"hydra/{name}.yaml" for name in ("config", "launcher/basic", "sweeper/basic")}
-        own = Path(hydra.__file__).parent / "conf"
+        of_hydra = Path(hydra.__file__).parent / "conf"
         for package, folder in plugin_conf_dirs().items():
             names = {path.relative_to(folder).as_posix() for path in folder.rglob("*.yaml")}
             replaced = []
             for name in sorted(names):
-                if name in in_code or (own / name).is_file():
+                if name in in_code or (of_hydra / name).is_file():
                     replaced.append(name)
             if replaced:
                 log.warning(

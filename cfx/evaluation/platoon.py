@@ -238,8 +238,8 @@ def simulate_platoons(
     parameters: dict[str, Tensor] = {}
     for frame in range(road.speed.shape[-1] - 1):
         if frame % windows.stride == 0:
-            seen = [road.history(frame, windows.length, part) for part in parts]
-            chosen, states = _choose(agents, seen, states, generator)
+            histories = [road.history(frame, windows.length, part) for part in parts]
+            chosen, states = _choose(agents, histories, states, generator)
             parameters = agents[0].space.unpack(chosen)
         follower, _, _ = stepper.advance(follower, road.leader(frame), parameters)
         road.write(frame + 1, follower)
@@ -248,14 +248,14 @@ def simulate_platoons(
 
 def _choose(
     agents: Sequence[Agent],
-    seen: Sequence[History],
+    histories: Sequence[History],
     states: Sequence[AgentState],
     generator: torch.Generator | None,
 ) -> tuple[Tensor, list[AgentState]]:
     """Returns the parameters of all followers `(V N, n)` and each agent's state afterwards."""
     chosen = []
     after = []
-    for agent, history, state in zip(agents, seen, states, strict=True):
+    for agent, history, state in zip(agents, histories, states, strict=True):
         parameters, state_after = agent.act(history, state, generator)
         chosen.append(parameters.view(VEHICLES, len(agent.names), -1))
         after.append(state_after)

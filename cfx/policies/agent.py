@@ -78,11 +78,11 @@ class AgentState(NamedTuple):
         shape = (self.state.shape[0], int(place.max()) + 1, *self.state.shape[2:])
         state = self.state.new_zeros(shape)
         state[network, place] = self.state[network, self.place[drivers]]
-        kept = {name: getattr(self, name)[drivers] for name in _OF_DRIVERS}
+        of_drivers = {name: getattr(self, name)[drivers] for name in _OF_DRIVERS}
         base = self.base
         if base is not None:
             base = base[drivers]
-        return AgentState(network=network, place=place, state=state, base=base, **kept)
+        return AgentState(network=network, place=place, state=state, base=base, **of_drivers)
 
 
 @dataclass(frozen=True)
@@ -189,10 +189,10 @@ class Agent:
             present: which of them have this window; the others keep their state, bool `(D,)`.
         """
         grid = self._features(history, state)
-        seen = torch.zeros(grid.shape[:2], dtype=torch.bool, device=grid.device)
-        seen[state.network, state.place] = present
+        observes = torch.zeros(grid.shape[:2], dtype=torch.bool, device=grid.device)
+        observes[state.network, state.place] = present
         with torch.no_grad():
-            return state._replace(state=self.core.observe(grid, state.state, seen))
+            return state._replace(state=self.core.observe(grid, state.state, observes))
 
     @torch.no_grad()
     def act(
@@ -398,8 +398,8 @@ class Agent:
                     f" which is not there; give a recording with a column {signal.column}, read by"
                     " data=tidy data.inputs=[...]"
                 )
-        seen = self.core.encode(history)
-        features = torch.cat([seen, state.conditioning.to(seen.dtype)], -1)
+        situation = self.core.encode(history)
+        features = torch.cat([situation, state.conditioning.to(situation.dtype)], -1)
         networks, drivers, _ = state.state.shape
         grid = self.core.scaler.mean.new_zeros((networks, drivers, features.shape[-1]))
         grid[state.network, state.place] = features.to(grid.dtype)

@@ -98,8 +98,8 @@ class Comparison:
                 "The jobs minimised different errors: they are ranked by the"
                 f" {self.judge.heading} on the test part."
             )
-        said = verdict(self.ranking)
-        return [*sentences, said] if said else sentences
+        judgement = verdict(self.ranking)
+        return [*sentences, judgement] if judgement else sentences
 
     def __repr__(self) -> str:
         """Returns the table and the verdict, for people."""

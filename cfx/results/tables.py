@@ -383,13 +383,13 @@ class KnownParameters:
         sentences = []
         if "noise" in self.rows:
             name = str(self.rows["noise"].iloc[0])
-            said = f"Noise: {_NOISE[name]} (calibration.noise={name})"
+            sentence = f"Noise: {_NOISE[name]} (calibration.noise={name})"
             others = {kind: value for kind, value in self.evidence.items() if kind != name}
             if others:
                 second = max(others, key=others.__getitem__)
                 ahead = self.evidence[name] - others[second]
-                said += f", the most evident kind; {second} comes next, {ahead:.0f} nats behind"
-            sentences.append(f"{said}.")
+                sentence += f", the most evident kind; {second} comes next, {ahead:.0f} nats behind"
+            sentences.append(f"{sentence}.")
         pairs = len(self.rows)
         if "held" in self.rows and not self.checked:
             sentences.append(
@@ -397,18 +397,18 @@ class KnownParameters:
             )
         if self.checked:
             missed = int(are_contradicted(self.rows).sum())
-            said = (
+            sentence = (
                 f"Forecasts from these posteriors hold {self.rows['held'].mean():.0%} of the"
                 f" held-out parts ({INTERVAL_LEVEL:.0%} would be right)"
             )
             allowed = UNLIKELY * pairs + 2.0 * math.sqrt(UNLIKELY * (1.0 - UNLIKELY) * pairs)
             if missed > allowed:
-                said += (
+                sentence += (
                     f"; of {missed} of {pairs} pairs less than chance allows (held_chance below"
                     f" {UNLIKELY:g} in fits.parquet): doubt the intervals, the model or its noise"
                     " is not theirs"
                 )
-            sentences.append(f"{said}.")
+            sentences.append(f"{sentence}.")
         return sentences
 
     def _doubts(self) -> list[str]:
@@ -765,6 +765,6 @@ class Past(ResultTable):
 
 def _ratio(error: pd.Series, table: pd.DataFrame) -> float:
     """Returns the median ratio of an error in the past to that of driver-specific parameters."""
-    own = table["past_rmse_speed_driver_specific"]
-    ratio = (error / own.where(own > 0)).dropna()
+    baseline = table["past_rmse_speed_driver_specific"]
+    ratio = (error / baseline.where(baseline > 0)).dropna()
     return float(ratio.median()) if len(ratio) else math.nan

@@ -393,8 +393,8 @@ def _state_of_data(node: Any) -> list[list[Any]] | None:
 def _sources(config: Any) -> tuple[Any, ...]:
     """Returns what else decides what the overrides mean: --config-name and --config-dir."""
     sources = config.hydra.runtime.config_sources
-    given = [str(source.path) for source in sources if source.provider == "command-line"]
-    return str(config.hydra.job.config_name), given
+    folders = [str(source.path) for source in sources if source.provider == "command-line"]
+    return str(config.hydra.job.config_name), folders
 
 
 OmegaConf.register_new_resolver("cfx_job", job_name, replace=True)

@@ -244,17 +244,17 @@ class SweepSummary:
         geometric = row.get("improvement_geometric")
         if geometric is None:
             return ""
-        said = f"{100 * geometric:+.1f} %"
+        cell = f"{100 * geometric:+.1f} %"
         low, high = row.get("improvement_ci95_low"), row.get("improvement_ci95_high")
         if low is not None and high is not None:
-            said += f" ({100 * low:+.1f} to {100 * high:+.1f})"
+            cell += f" ({100 * low:+.1f} to {100 * high:+.1f})"
         baseline, comma, part = row["improvement_over"].partition(",")
-        said += f"\nover {short_label(baseline)}{comma}{part}"
+        cell += f"\nover {short_label(baseline)}{comma}{part}"
         estimates = {"geometric": geometric}
         for name in ("ratio_of_means", "drivers"):
             if row.get(f"improvement_{name}") is not None:
                 estimates[name] = row[f"improvement_{name}"]
-        return "\n".join([said, *doubts(estimates)])
+        return "\n".join([cell, *doubts(estimates)])
 
     def sentences(self) -> list[str]:
         """Returns how the jobs were compared, and which is closest to the drivers."""

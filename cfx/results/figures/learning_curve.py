@@ -42,8 +42,8 @@ def loss_quartiles(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
         losses = curves.over_networks(table, column)
         if not losses.empty:
             count = min(_MOST_POINTS, len(losses))
-            kept = np.unique(np.linspace(0, len(losses) - 1, count).round().astype(int))
-            quartiles[column] = losses.iloc[kept].quantile((0.25, 0.5, 0.75), axis=1).T
+            drawn = np.unique(np.linspace(0, len(losses) - 1, count).round().astype(int))
+            quartiles[column] = losses.iloc[drawn].quantile((0.25, 0.5, 0.75), axis=1).T
     return quartiles
 
 

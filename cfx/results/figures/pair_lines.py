@@ -152,8 +152,8 @@ def _signal_panel(
 
 def _range(lines: Sequence[canvas.Line]) -> tuple[float | None, float | None]:
     """Returns the lowest and the highest value of the lines that are not hidden; None for none."""
-    seen = [line.values for line in lines if not line.hidden]
-    values = canvas.finite(np.concatenate([np.empty(0), *seen]))
+    visible = [line.values for line in lines if not line.hidden]
+    values = canvas.finite(np.concatenate([np.empty(0), *visible]))
     if not len(values):
         return None, None
     return float(values.min()), float(values.max())
@@ -171,13 +171,13 @@ def _collisions(lines: Sequence[canvas.Line]) -> tuple[tuple[str, float, float],
 
 def _parameter_panel(parameter: ParameterAxis, lines: tuple[canvas.Line, ...]) -> Panel:
     """Chooses an axis of at least a fifth of the range: a small change looks small."""
-    title, said = wording.unit_label(parameter.name, parameter.unit), parameter.meaning
+    title, meaning = wording.unit_label(parameter.name, parameter.unit), parameter.meaning
     lowest, highest = _range(lines)
     if parameter.low is None or parameter.high is None:
         if lowest is None or highest is None:
-            return Panel(title, lines, None, None, meaning=said)
+            return Panel(title, lines, None, None, meaning=meaning)
         margin = 0.15 * max(highest - lowest, 1e-3 * abs(highest), 1e-6)
-        return Panel(title, lines, lowest - margin, highest + margin, meaning=said)
+        return Panel(title, lines, lowest - margin, highest + margin, meaning=meaning)
     bounds = (parameter.low, parameter.high)
     if lowest is None or highest is None:
         lowest, highest = bounds
@@ -185,7 +185,7 @@ def _parameter_panel(parameter: ParameterAxis, lines: tuple[canvas.Line, ...]) -
     centre, margin = (highest + lowest) / 2, 0.06 * width
     low = max(centre - width / 2, min(bounds[0], lowest)) - margin
     high = min(centre + width / 2, max(bounds[1], highest)) + margin
-    return Panel(title, lines, low, high, bounds=bounds, meaning=said)
+    return Panel(title, lines, low, high, bounds=bounds, meaning=meaning)
 
 
 _LINE = 150

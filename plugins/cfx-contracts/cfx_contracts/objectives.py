@@ -127,9 +127,9 @@ def one_frame_needs_no_dimension_of_time(objective: Objective) -> None:
     whole = objective.terms(frames)
     assert isinstance(terms, tuple), "terms returns a tuple of tensors"
     assert len(terms) == len(whole), "terms returns as many tensors in every call"
-    for one, many in zip(terms, whole, strict=True):
+    for of_frame, many in zip(terms, whole, strict=True):
         expect_close(
-            one, many[0], msg="a rollout asks for the terms of one frame `(*batch,)` at a time"
+            of_frame, many[0], msg="a rollout asks for the terms of one frame `(*batch,)` at a time"
         )
 
 

@@ -32,8 +32,15 @@ def history_curves(history: pd.DataFrame) -> pd.DataFrame:
             if len(chosen):
                 ratios = 1.0 - chosen["improvement"].to_numpy(dtype=float)
                 drivers = chosen["driver"].astype(str).tolist()
-                one = statistics.improvement_statistics(np.ones_like(ratios), ratios, drivers)
-                numbers = (one.geometric, one.ci95_low, one.ci95_high, one.pairs)
+                improvement = statistics.improvement_statistics(
+                    np.ones_like(ratios), ratios, drivers
+                )
+                numbers = (
+                    improvement.geometric,
+                    improvement.ci95_low,
+                    improvement.ci95_high,
+                    improvement.pairs,
+                )
                 rows.append((str(base), amount, *numbers))
     return pd.DataFrame(rows, columns=["base", "amount", "geometric", "low", "high", "pairs"])
 
