@@ -136,7 +136,7 @@ def one_frame_needs_no_dimension_of_time(objective: Objective) -> None:
 def it_is_the_metric_that_it_names(objective: Objective) -> None:
     if not objective.metric:
         return
-    metric = judged_by(MetricSet.of(["rmse_speed"]), objective).metrics[0].metric
+    metric = judged_by(MetricSet.of(["rmse_speed"]), objective).metrics[0].component
     frames = trajectories()
     expect_close(
         ObjectiveMetric("", objective).compute(frames),
