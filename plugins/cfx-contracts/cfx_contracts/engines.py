@@ -44,7 +44,7 @@ def _nothing(_units: int) -> None:
 def every_shard_has_its_own_result(engine: Engine) -> None:
     expected = {}
     for number, shard in enumerate(_shards()):
-        expected[number] = [number_of_shard * number_of_shard for number_of_shard in shard]
+        expected[number] = [value * value for value in shard]
     for shares_cores in (True, False):
         with closing(engine):
             results = dict(engine.map(_squares, _shards(), _nothing, shares_cores=shares_cores))

@@ -322,9 +322,9 @@ def _state(result: TrainingResult) -> dict[str, Tensor]:
 
 
 def _equal(weights: dict[str, Tensor], others: dict[str, Tensor]) -> bool:
-    return weights.keys() == others.keys() and all(
-        torch.equal(weights[key], others[key]) for key in weights
-    )
+    if weights.keys() != others.keys():
+        return False
+    return all(torch.equal(weights[key], others[key]) for key in weights)
 
 
 CONTRACT = contract_of(

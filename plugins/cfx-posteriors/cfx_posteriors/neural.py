@@ -196,21 +196,20 @@ class _Reader:
         scored, order = self.posterior.scored, self.posterior.order
         away = (errors - self.mean[..., None]) * self.posterior.counted
         identity = torch.eye(self.slopes.shape[-1], dtype=away.dtype)
-        gradients = []
+        estimates = []  # of parameters, by weighted least squares for each correlation
         for correlation in away.new_tensor(_CORRELATIONS):
             slopes = noise.filtered(self.slopes, correlation[None]) * scored
             white = noise.filtered(away, correlation[None]) * scored
             slopes = slopes / self.scale[:, None]
             white = white / self.scale[:, None]
             precision = torch.einsum("kpi,kpj->pij", slopes, slopes) + identity
-            gradients.append(
-                torch.linalg.solve(precision, torch.einsum("kpi,kpq->piq", slopes, white))
-            )
-        left = away - torch.einsum("kpi,piq->kpq", self.slopes, gradients[0])
+            projected = torch.einsum("kpi,kpq->piq", slopes, white)
+            estimates.append(torch.linalg.solve(precision, projected))
+        left = away - torch.einsum("kpi,piq->kpq", self.slopes, estimates[0])
         products = noise.lagged_products(left, scored, order)
         lags = products[..., 0, 1:] / products[..., :1, 0].clamp(min=1e-12)
         about = noise.first_noise(products, self.posterior.count)
-        return torch.cat([*(gradient.mT for gradient in gradients), about, lags], dim=-1)
+        return torch.cat([*(estimate.mT for estimate in estimates), about, lags], dim=-1)
 
 
 class _Embedding(nn.Module):
@@ -325,9 +324,8 @@ def _learned(posterior: Posterior, shares: Tensor, seed: int, memory: int) -> Le
 
     # The flow's own samples are of a prior that is its region.
     from_flow = drawn[:, :_OF_FLOW]
-    prior = posterior.prior.log_density(from_flow[..., :n]) + noise.prior_log_density(
-        from_flow[..., n:]
-    )
+    prior = posterior.prior.log_density(from_flow[..., :n])
+    prior = prior + noise.prior_log_density(from_flow[..., n:])
     inner = rounds[-1].region.inner(from_flow)
     of_flow = (prior + 0.5 * inner.square().sum(-1)).softmax(dim=1)
     trusted = (k <= MAX_PARETO_K)[:, None, None]

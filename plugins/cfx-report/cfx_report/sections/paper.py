@@ -147,11 +147,9 @@ def _compared(better: Mapping[str, str], judged: str, jobs: Sequence[Result]) ->
     said = []
     for same, improvements in gains.items():
         if {better["with"], better["than"]} <= set(improvements):
-            more = (
-                "better"
-                if improvements[better["with"]] > improvements[better["than"]]
-                else "no better"
-            )
+            more = "no better"
+            if improvements[better["with"]] > improvements[better["than"]]:
+                more = "better"
             said.append(
                 f"{same}: the policy fares {more} with {better['with']} than with {better['than']}"
                 " here; better in the paper."
