@@ -170,9 +170,7 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: improvement_bars.Improve
         colour = colours.JOB_COLOURS[k % len(colours.JOB_COLOURS)]
         handles.append(Patch(color=colour, label=wording.shortened(group.name, 60)))
         for place, cluster in enumerate(order):
-            inside = np.array(
-                [own_cluster == cluster for own_cluster in group.clusters], dtype=bool
-            )
+            inside = np.asarray(group.clusters, dtype=object) == cluster
             values = canvas.finite(group.values[inside])
             if not len(values):
                 continue
