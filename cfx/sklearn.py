@@ -29,13 +29,13 @@ from cfx.simulation.windows import Split
 class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc] # no types
     """Pooled calibration of a driving model: fitted on some drivers, it predicts others' speeds.
 
-    A sample is a row of a table in the tidy layout, in a data frame of any library that `cfx.read`
-    takes: one frame of one pair. Rows of a pair belong
-    together: split them by `groups`, as `GroupKFold` does.
+    A sample is one frame of one pair: a row of a table in the tidy layout, in a data frame of any
+    library that `cfx.read` takes. All rows of a pair form one trajectory, so they must stay in one
+    fold: split by `groups`, as `GroupKFold` does.
 
-    Of scikit-learn's `check_estimator` those checks apply, and pass, that are about parameters,
-    cloning, tags and representation. Those that feed arrays of random numbers do not: a row without
-    its pair and its time is no trajectory. The tag `two_d_array=False` says so.
+    The checks of scikit-learn's `check_estimator` that concern parameters, cloning, tags and
+    representation pass. Its other checks fit arrays of random numbers, which hold no pair and no
+    time and so no trajectory; the tag `two_d_array=False` excludes them.
 
     Args:
         model: as after `model=`.
@@ -102,10 +102,10 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         """
         check_is_fitted(self)
         table = frame_of_any(X, "X")
-        # Those of calibration, such as the optimizer's, do nothing where nobody calibrates.
+        # A prediction calibrates nothing, so settings such as the optimizer's have no place here.
         settings = self.settings or {}
-        kept = [key for key in settings if key.startswith(("model.", "data."))]
-        of_model = {key: settings[key] for key in kept}
+        keys = [key for key in settings if key.startswith(("model.", "data."))]
+        of_model = {key: settings[key] for key in keys}
         drive = simulate(self.model, self.parameters_, _pairs(table), **of_model)
         order = row_order(table)
         speed = np.empty(len(order))
@@ -131,7 +131,7 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         return -float(losses.mean())
 
     def _prepared(self, pairs: Pairs) -> tuple[ProtocolContext, Tensor]:
-        """Returns what calibrates, and the last frame of each pair."""
+        """Returns the context with the calibrator of these pairs, and each pair's last frame."""
         chosen = {"model": self.model, "objective": self.objective, "seed": self.seed}
         settings = {"policy": "fixed", "protocol": "within_driver", **(self.settings or {})}
         with visit():

@@ -228,9 +228,9 @@ class Fit:
         if settings.posterior == "none":
             raise ConfigError(f"there is no posterior; {_ask_for('laplace')}")
         with visit():
-            own, solver = self._tensor("driver_specific"), context.calibrator.solver
+            driver_specific, solver = self._tensor("driver_specific"), context.calibrator.solver
             method = posterior_method(settings.posterior)
-            return method.find(solver, context.batch, self._last, own, settings)
+            return method.find(solver, context.batch, self._last, driver_specific, settings)
 
     def plot(self, name: str = "parameters", pair_id: PairIds | None = None) -> Figure:
         """Draws the fit.
@@ -369,9 +369,9 @@ class Fit:
             name = f"{part}_{metric}"
             if name in self.losses:
                 means = self.losses.groupby("method")[name].mean()
-                said = [f"{short_label(method)} {means[method]:.3f}" for method in METHODS]
+                errors = [f"{short_label(method)} {means[method]:.3f}" for method in METHODS]
                 heading, unit = ERRORS[metric]
-                lines.append(f"{heading}, {unit}: {', '.join(said)}")
+                lines.append(f"{heading}, {unit}: {', '.join(errors)}")
         few = self.losses["driver"].nunique()
         about = plural(len(self.parameters), "pair")
         if few < FEW_DRIVERS:

@@ -40,7 +40,7 @@ def chosen_names(pair_ids: PairIds, available: Sequence[str], source: str) -> li
 
     Args:
         pair_ids: what they choose.
-        known: names of all pairs.
+        available: names of all pairs.
         source: what messages call these.
 
     Raises:
@@ -219,16 +219,16 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
     """
     if isinstance(source, Pairs):
         raise ConfigError("these pairs have been read already; give a file or a data frame")
-    given = {f"data.{key}": value for key, value in settings.items()}
+    overrides = {f"data.{key}": value for key, value in settings.items()}
     if source is None:
         if dataset is None:
             raise ConfigError("give a file or a data frame, or dataset=NAME")
-        return Pairs.of(config_of({"data": dataset, **given}).data)
+        return Pairs.of(config_of({"data": dataset, **overrides}).data)
     source = _all_of(source)
     frame = frame_of_source(source)
     if frame is not None:
-        given["data.path"] = IN_MEMORY
-        node = config_of({"data": dataset or "tidy", **given}).data
+        overrides["data.path"] = IN_MEMORY
+        node = config_of({"data": dataset or "tidy", **overrides}).data
         values = {key: value for key, value in node.items() if key != "name"}
         made = validate(TidySettings, values, where="data")
         return Pairs(FrameDataset(made, frame).load(), node)
@@ -236,8 +236,8 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
     paths = [path if is_url(str(path)) else str(absolute(path)) for path in paths]
     own_columns = {"columns", "units"} & settings.keys()
     name = dataset or ("tidy" if own_columns else dataset_of(Path(str(paths[0]))))
-    given["data.path"] = paths[0] if len(paths) == 1 else paths
-    return Pairs.of(config_of({"data": name, **given}).data)
+    overrides["data.path"] = paths[0] if len(paths) == 1 else paths
+    return Pairs.of(config_of({"data": name, **overrides}).data)
 
 
 def _all_of(source: Any) -> Any:
@@ -262,30 +262,30 @@ def _paths(source: Any) -> list[str | Path]:
     return paths
 
 
-def pairs_from(given: PairsLike, settings: Mapping[str, Any] | None = None) -> Pairs:
+def pairs_from(source: PairsLike, settings: Mapping[str, Any] | None = None) -> Pairs:
     """Returns pairs of whatever `cfx.read` takes.
 
     Args:
-        given: a file or a table is read, pairs that have been read are returned.
+        source: a file or a table is read, pairs that have been read are returned.
         settings: of a call; those of `data` say how a file or a table is read.
 
     Raises:
         ConfigError: the pairs have been read already, so that a setting of `data` does nothing.
     """
     of_data = {key: value for key, value in (settings or {}).items() if _is_of_data(key)}
-    if isinstance(given, Pairs | PairSet):
+    if isinstance(source, Pairs | PairSet):
         if of_data:
             key, value = next(iter(of_data.items()))
             raise ConfigError(
                 f"{key}={value}: these pairs have been read already, so it does nothing; say it"
                 f" where they are read: cfx.read(..., {key.partition('.')[2] or 'dataset'}=...)"
             )
-        if isinstance(given, PairSet):
-            return Pairs(given, {"name": "tidy", "path": IN_MEMORY})
-        return given
+        if isinstance(source, PairSet):
+            return Pairs(source, {"name": "tidy", "path": IN_MEMORY})
+        return source
     dataset = of_data.pop("data", None)
     reading = {key.partition(".")[2]: value for key, value in of_data.items()}
-    return read(given, dataset=dataset, **reading)
+    return read(source, dataset=dataset, **reading)
 
 
 def without_data(settings: Mapping[str, Any]) -> dict[str, Any]:

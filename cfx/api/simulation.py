@@ -127,7 +127,7 @@ def simulate(
                 f"at={at:g}: the shortest pair has {int(batch.lengths.min())} frames of"
                 f" {batch.dt:g} s; give a time within it"
             )
-        given = _values(parameters, recording.ids, made)
+        values = _values(parameters, recording.ids, made)
         ahead = Leader(
             batch.leader_position[:, first:],
             batch.leader_speed[:, first:],
@@ -139,7 +139,7 @@ def simulate(
             batch.follower_speed[:, first],
             batch.follower_acceleration[:, first],
         )
-        trajectory = rollout(made, given, ahead, start, batch.dt)
+        trajectory = rollout(made, values, ahead, start, batch.dt)
         return _table(recording, trajectory, start.acceleration, first)
 
 

@@ -16,7 +16,8 @@ import sys
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -150,7 +151,12 @@ class JobFunction:
                     judge = judge_of_folder(folder).name
                     return main_error(metrics_of(folder), judge), status
                 (folder / STATUS).unlink(missing_ok=True)  # what it says is no longer so
-            result = _run_job(values, folder, self.run_job)
+            # Importing these takes a tenth of a second and more, which `--help` does not wait for.
+            from cfx.app.job.run import run_job
+            from cfx.results.config import JobConfig
+
+            with plugins_blamed():
+                result = (self.run_job or run_job)(JobConfig.of(values), folder)
         except (Exception, SystemExit) as error:
             status = self._failed(error, blank)
             if status.code == CfxError.exit_code:
@@ -176,11 +182,35 @@ class JobFunction:
 
 
 def start(arguments: Sequence[str], *, run_job: RunJob | None = None) -> int:
-    """Runs the Hydra application and returns its exit code; prints each message once."""
+    """Lets Hydra compose the configuration and run the job or the jobs; prints each message once.
+
+    Args:
+        arguments: of the command line.
+        run_job: runs a job; None: cfx's own.
+
+    Returns:
+        The exit code.
+
+    Raises:
+        ConfigError: Hydra would act upon an argument before a job can refuse it.
+    """
     _refuse(arguments)
     job = JobFunction(run_job, uuid.uuid4().hex, wants_traceback(arguments))
     SweepFolder.take()
-    code = _run_hydra(job, arguments)
+    application = hydra.main(
+        config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
+    )
+    code = 0
+    try:
+        with guest(), own_hydra(), terminable():
+            sys.argv = ["cfx", *arguments]
+            os.environ["HYDRA_FULL_ERROR"] = "1"
+            hydra_source.register()
+            application(job)()
+    except BrokenPipeError:
+        raise  # the reader of stdout has gone; `cfx.app.cli.main` knows what that means
+    except (Exception, SystemExit, KeyboardInterrupt, Terminated, Refused) as error:
+        code = _exit_code(error, arguments, job.show_traceback)
     sweep = SweepFolder.take()
     if sweep is not None:
         return sweep.close(job.multirun, code, interrupted=code in {INTERRUPTED, TERMINATED})
@@ -218,34 +248,19 @@ def _refuse(arguments: Sequence[str]) -> None:
             )
 
 
-def _run_hydra(job: JobFunction, arguments: Sequence[str]) -> int:
-    """Lets Hydra compose and call `job`; every way in which that ends becomes an exit code."""
-    overrides = [argument for argument in arguments if not argument.startswith("-")]
-    application = hydra.main(
-        config_path=str(nodes.conf_dir()), config_name="config", version_base="1.3"
-    )
-    try:
-        with guest(), own_hydra(), terminable():
-            sys.argv = ["cfx", *arguments]
-            os.environ["HYDRA_FULL_ERROR"] = "1"
-            hydra_source.register()
-            application(job)()
-    except SystemExit as error:
+def _exit_code(error: BaseException, arguments: Sequence[str], show_traceback: bool) -> int:
+    """Returns the exit code after what Hydra ended in, and prints what is to be said of it."""
+    if isinstance(error, SystemExit):
         # Hydra exits with 0 after --help and the like, with 1 or argparse's 2 after a message about
         # a wrong flag.
         return 2 if error.code else 0
-    except Refused as error:
-        return _report(error.__cause__, overrides, job.show_traceback)
-    except (KeyboardInterrupt, Terminated) as error:
-        return _interrupted(error)
-    except BrokenPipeError:
-        raise  # the reader of stdout has gone; `cfx.app.cli.main` knows what that means
-    except Exception as error:
-        signalled = signal_behind(error)
-        if signalled is not None:
-            return _interrupted(signalled)
-        return _report(error, overrides, job.show_traceback)
-    return 0
+    overrides = [argument for argument in arguments if not argument.startswith("-")]
+    if isinstance(error, Refused):
+        return _report(error.__cause__, overrides, show_traceback)
+    signalled = signal_behind(error)
+    if signalled is not None:
+        return _interrupted(signalled)
+    return _report(error, overrides, show_traceback)
 
 
 def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> Result:
@@ -270,8 +285,11 @@ def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> Resu
                 folder = new_folder(Path(str(config.hydra.run.dir)).absolute())
         messages = logging.FileHandler(folder / "cfx.log", encoding="utf-8")
         messages.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        with console_logging(handler=messages):
-            return _run_job(values, folder, run_job)
+        from cfx.app.job.run import run_job as own_job
+        from cfx.results.config import JobConfig
+
+        with console_logging(handler=messages), plugins_blamed():
+            return (run_job or own_job)(JobConfig.of(values), folder)
 
 
 def wants_traceback(arguments: Sequence[str]) -> bool:
@@ -285,18 +303,15 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
     return False
 
 
-def _run_job(values: Mapping[str, Any], folder: Path, run_job: RunJob | None) -> Result:
-    """Runs a job; what a plugin raises is attributed to its distribution.
+@contextmanager
+def plugins_blamed() -> Iterator[None]:
+    """Attributes what a plugin raises in the block to its distribution.
 
     Raises:
         CfxError: the user's mistake, with the plugin's distribution; or memory ran out.
     """
-    # Importing these takes a tenth of a second and more, which `--help` does not wait for.
-    from cfx.app.job.run import run_job as own_job
-    from cfx.results.config import JobConfig
-
     try:
-        return (run_job or own_job)(JobConfig.of(values), folder)
+        yield
     except CfxError:
         raise
     except (Exception, SystemExit) as error:  # a plugin may raise anything
@@ -331,10 +346,11 @@ def _interrupted(signalled: BaseException) -> int:
 def _preset_behind(status: JobStatus, values: Mapping[str, Any]) -> str:
     """Returns, to go after a message about a key, the preset that set it; "" if none did."""
     key = re.match(r"\w+(\.\w+)+", status.message)
-    if key is None or any(
-        override.lstrip("+").startswith(f"{key[0]}=") for override in status.overrides
-    ):
+    if key is None:
         return ""
+    for override in status.overrides:
+        if override.lstrip("+").startswith(f"{key[0]}="):  # the user did
+            return ""
     group = key[0].partition(".")[0]
     choice, node = HydraConfig.get().runtime.choices.get(group), values.get(group)
     if not isinstance(choice, str) or not isinstance(node, Mapping) or node.get("name") == choice:

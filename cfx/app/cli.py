@@ -77,7 +77,12 @@ def _run(arguments: Sequence[str]) -> int:
     from cfx.app import application
 
     # Hydra knows no `--verbose`: it is a setting.
-    settings = ["output.verbose=true" if word == "--verbose" else word for word in arguments]
+    settings = []
+    for word in arguments:
+        if word == "--verbose":
+            settings.append("output.verbose=true")
+        else:
+            settings.append(word)
     return application.start(settings)
 
 

@@ -45,17 +45,17 @@ def answer(arguments: Sequence[str]) -> int:
         print("\n".join(words))
         return 0
     if not blank:
-        own = [name for name in commands if name.startswith(first) and "." not in name]
-        print("\n".join(own))
-        if own and first:
+        roots = [name for name in commands if name.startswith(first) and "." not in name]
+        print("\n".join(roots))
+        if roots and first:
             return 0
     from cfx.app import application  # takes ten times as long as all of the above
 
-    said = io.StringIO()
-    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(said):
+    printed = io.StringIO()
+    with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(printed):
         code = application.start(arguments)
     if code == 0:
-        print(said.getvalue())
+        print(printed.getvalue())
     return 0
 
 

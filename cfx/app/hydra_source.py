@@ -105,10 +105,13 @@ class ComponentSearchPath(SearchPathPlugin):
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
         # A file of such a name on the search path would replace Hydra's own.
         in_code = {f"hydra/{name}.yaml" for name in ("config", "launcher/basic", "sweeper/basic")}
-        own = Path(hydra.__file__).parent / "conf"
+        of_hydra = Path(hydra.__file__).parent / "conf"
         for package, folder in plugin_conf_dirs().items():
             names = {path.relative_to(folder).as_posix() for path in folder.rglob("*.yaml")}
-            replaced = [name for name in sorted(names) if name in in_code or (own / name).is_file()]
+            replaced = []
+            for name in sorted(names):
+                if name in in_code or (of_hydra / name).is_file():
+                    replaced.append(name)
             if replaced:
                 log.warning(
                     "The plugin %s brings %s, which would replace Hydra's own; its folder %s is"
@@ -127,7 +130,10 @@ def plugin_conf_dirs() -> dict[str, Path]:
 
     Runs no code of theirs.
     """
-    packages = {entry.package for kind in registry.KINDS for entry in registry.entries(kind)}
+    packages = set()
+    for kind in registry.KINDS:
+        for entry in registry.entries(kind):
+            packages.add(entry.package)
     folders: dict[str, Path] = {}
     for package in sorted(packages - {"cfx"}):
         with suppress(ImportError, ValueError):  # a broken distribution harms nobody else

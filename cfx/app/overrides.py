@@ -1,4 +1,4 @@
-"""Overrides as Hydra's grammar reads them, and those that make a configuration once more."""
+"""From settings to a configuration and back to the command line that composes it."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from cfx.results.config import JobConfig
 
 
 def override(key: str, value: Any) -> str:
-    """Returns the override that gives a setting, such as `data.min_duration`, a plain value."""
+    """Returns the override `key=value` in Hydra's grammar, such as `data.min_duration=30`."""
     return f"{key}={_text(value)}"
 
 
 def config_of(settings: Mapping[str, Any]) -> JobConfig:
-    """Composes a configuration as the command line does; None is `null`, and so is "null".
+    """Composes a configuration as the command line does; None and the text "null" mean `null`.
 
     Raises:
         CfxError: a name or a value is wrong.
@@ -44,7 +44,7 @@ def command_of(config: JobConfig) -> str:
     """Returns the command line that runs a configuration.
 
     Raises:
-        DataError: it uses what is in the memory of a program alone.
+        DataError: its pairs or its policy are in this program's memory and in no file.
     """
     if IN_MEMORY in str(config.data.get("path")):
         raise DataError(
@@ -62,7 +62,8 @@ def command_of(config: JobConfig) -> str:
 def overrides_of(config: JobConfig) -> tuple[str, ...]:
     """Returns overrides that compose a configuration.
 
-    They name the experiment, the model, the components and settings that differ from the usual.
+    They name the experiment and the model, and what differs from the defaults that these have:
+    other components first, then single settings.
     """
     values = config.model_dump(mode="json")
     chosen = []
@@ -75,8 +76,7 @@ def overrides_of(config: JobConfig) -> tuple[str, ...]:
         if node is not None and (group == "model" or not is_usual):
             chosen.append(f"{group}={node.get('name')}")
     usual = _composed(chosen)
-    for key in ("preset", *[key for key in values if values[key] == usual.get(key)]):
-        values.pop(key, None)
+    values.pop("preset")
     chosen += _differences("", values, usual)
     return tuple(chosen)
 
@@ -107,11 +107,12 @@ def _text(value: Any) -> str:
     """Returns a value in Hydra's grammar."""
     if isinstance(value, str | Path):
         text = str(value)
-        is_other = text.lower() in {"true", "false", "null"}  # which quotes make a text
+        # Without quotes Hydra would read such a text as a Boolean, as null or as a number.
+        is_ambiguous = text.lower() in {"true", "false", "null"}
         with contextlib.suppress(ValueError):
             float(text)
-            is_other = True
-        return quoted(text, always=is_other)
+            is_ambiguous = True
+        return quoted(text, always=is_ambiguous)
     if isinstance(value, Mapping):
         pairs = [f"{_text(key)}: {_text(item)}" for key, item in value.items()]
         return "{" + ", ".join(pairs) + "}"

@@ -118,22 +118,25 @@ def _unreadable(error: OverrideParseException) -> str:
 
 def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     """Returns a sentence with the keys that there are where `key` was looked for."""
-    written = [one for one in overrides if re.match(rf"\+*{re.escape(key)}\b", one)]
-    given = written[0] if written else key
-    others = [override for override in overrides if override != given]
+    typed, of_key = key, re.compile(rf"\+*{re.escape(key)}\b")
+    for override in overrides:
+        if of_key.match(override):
+            typed = override
+            break
+    others = [override for override in overrides if override != typed]
     try:
         config: Any = hydra_source.composed(others)
     except Exception:  # the other overrides may be wrong too; the sentence is then without advice
-        return f"{given}: there is no key '{key}'; cfx --cfg job prints every key"
+        return f"{typed}: there is no key '{key}'; cfx --cfg job prints every key"
     node = OmegaConf.select(config, key)
     if isinstance(node, DictConfig):  # a name in the override's mapping may be wrong
-        value = OverridesParser.create().parse_override(given).value()
+        value = OverridesParser.create().parse_override(typed).value()
         names = [str(name) for name in value] if isinstance(value, dict) else []
         unknown = [name for name in names if name not in node]
         if unknown:
             sentence = _unknown_key(f"{key}.{unknown[0]}", others)
             if len(unknown) == len(names) and "Did you mean" not in sentence:
-                value = given.partition("=")[2]
+                value = typed.partition("=")[2]
                 sentence += f" To replace all of them: '~{key}' '+{key}={value}'"
             return sentence
     parent, _, last = key.rpartition(".")
@@ -149,11 +152,11 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
             heading = f"Known keys of {parent}"
         elsewhere = _options_with(parent, last, str(siblings.get("name", "")))
         return (
-            f"{given}: there is no key '{key}'.{elsewhere or advice} {heading}: {', '.join(names)}."
+            f"{typed}: there is no key '{key}'.{elsewhere or advice} {heading}: {', '.join(names)}."
         )
     everything: Any = OmegaConf.to_container(config, resolve=False)
     paths = _keys(everything)
-    return f"{given}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
+    return f"{typed}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
 
 
 def _options_with(group: str, setting: str, chosen: str) -> str:

@@ -151,10 +151,10 @@ class BotorchOptimizer(Optimizer):
     def bytes_per_problem(self, n: int) -> int:
         # Measured: a fit holds about 24 matrices (seen, seen) for its gradient, LogEI about 8 of
         # (raw samples, seen).
-        seen = self.settings.initial + self.settings.iterations
-        query = self.settings.raw_samples * (8 * seen + 6 * n)
-        climb = self.settings.restarts * (24 * seen + 12 * n)
-        return 8 * (max(query, climb, 24 * seen * seen) + 8 * seen * n)
+        evaluated = self.settings.initial + self.settings.iterations
+        query = self.settings.raw_samples * (8 * evaluated + 6 * n)
+        climb = self.settings.restarts * (24 * evaluated + 12 * n)
+        return 8 * (max(query, climb, 24 * evaluated * evaluated) + 8 * evaluated * n)
 
     def solve(
         self, objective: CandidateLosses, guesses: Tensor, *, seed: int
@@ -182,9 +182,9 @@ class _BatchSearch:
     ) -> None:
         self._settings = settings
         self._generator = torch.Generator().manual_seed(seed)
-        kept = _best_of(losses, guesses, settings.initial)
-        self._seen = tried.gather(1, kept[..., None].expand(-1, -1, tried.shape[-1]))
-        self._losses = losses.gather(1, kept)
+        best = _best_of(losses, guesses, settings.initial)
+        self._seen = tried.gather(1, best[..., None].expand(-1, -1, tried.shape[-1]))
+        self._losses = losses.gather(1, best)
         batch = torch.Size([tried.shape[0]])
         self._mean = ConstantMean(batch_shape=batch).to(tried)
         self._kernel = _kernel(tried.shape[-1], batch).to(tried)

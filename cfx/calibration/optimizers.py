@@ -257,8 +257,8 @@ class Optimizer(Component):
                 of evaluations than it says.
         """
         problems, _, n = guesses.shape
-        evaluations, kept = self.evaluations(n), self.returned(n)
-        returned = 8 * kept * (2 * n + 4)
+        evaluations, candidates = self.evaluations(n), self.returned(n)
+        returned = 8 * candidates * (2 * n + 4)
         each = self.bytes_per_problem(n) + returned + objective_bytes * self.evaluations_at_once(n)
         require_memory(each, f"an optimizer with {evaluations:,} evaluations of each problem")
         shards_at_once = 1
@@ -266,8 +266,8 @@ class Optimizer(Component):
             shards_at_once = cores()
         size = max(1, min(problems, memory // (each * shards_at_once)))
         if guesses.device.type == "cpu":
-            size = min(size, max(1, _LOSSES_AT_ONCE // kept))
-            if kept < evaluations:
+            size = min(size, max(1, _LOSSES_AT_ONCE // candidates))
+            if candidates < evaluations:
                 size = min(size, _SEARCHED_AT_ONCE)
         guesses = guesses.double().clamp(0.0, 1.0)
         ended = Event()

@@ -200,9 +200,9 @@ class ShadeSearch(Optimizer):
         searched = _evolved(begun, objective.rough(), plan.first_generations, draws)
         searched, searched_losses = _finished(searched, objective, draws)
         ends, order = searched.loss[:, :, 0].sort(dim=1, stable=True)
-        kept = searched.points.flatten(1, 2)
+        last_population = searched.points.flatten(1, 2)
         best = searched.best.gather(1, order[..., None].expand(-1, -1, n))[:, :2]
-        tried = [first, kept]
+        tried = [first, last_population]
         found = [losses, searched_losses]
         # What problems without a long search return in its place: their best candidate.
         later = best[:, :1].repeat(1, plan.kept, 1)
@@ -327,7 +327,7 @@ class _Plan(NamedTuple):
             in_generation = populations * _size(number)
             stages.append(max(1, (budget - least) // (len(_STAGES) * in_generation)))
             spent += stages[-1] * in_generation
-        kept = _STAGES[-1] * _MERGED_SIZE
+        merged = _STAGES[-1] * _MERGED_SIZE
         spent += least
         return cls(
             first_points,
@@ -335,7 +335,7 @@ class _Plan(NamedTuple):
             long_points,
             tuple(stages),
             spent,
-            kept,
+            merged,
             thorough,
             scatter_rounds,
         )
@@ -494,7 +494,7 @@ def _next_generation(
     """Tries one candidate beside each; the better of both stays."""
     points, loss, archive, history_f, history_cr, place = populations
     problems, count, size, n = points.shape
-    kept = archive.shape[2]
+    archived = archive.shape[2]
 
     def at(candidates: Tensor, numbers: Tensor) -> Tensor:
         return candidates.gather(2, numbers[None, ..., None].expand(problems, -1, -1, n))
@@ -507,9 +507,9 @@ def _next_generation(
     cr = (mean_cr + _SPREAD * draws.normal(count, size)).clamp(0.0, 1.0)
     # current-to-pbest/1: towards one of the best, and along the difference of two others.
     towards = draws.below(max(2, math.ceil(_BEST * size)), count, size)
-    own = torch.arange(size, device=points.device)
-    second = (own + 1 + draws.below(size - 1, count, size)) % size
-    other = (own + 1 + draws.below(size + kept - 1, count, size)) % (size + kept)
+    member = torch.arange(size, device=points.device)
+    second = (member + 1 + draws.below(size - 1, count, size)) % size
+    other = (member + 1 + draws.below(size + archived - 1, count, size)) % (size + archived)
     both = torch.cat([points, archive], dim=2)
     moved = at(points, towards) - points + at(points, second) - at(both, other)
     trial = points + f[..., None] * moved
@@ -522,7 +522,7 @@ def _next_generation(
     tried = objective(trial.flatten(1, 2)).view_as(loss)
     better = tried < loss
     history_f, history_cr, place = _remembered(populations, f, cr, tried, better)
-    slots = draws.uniform(count, kept).argsort(dim=-1)[:, :size]
+    slots = draws.uniform(count, archived).argsort(dim=-1)[:, :size]
     slots = slots[None, ..., None].expand(problems, -1, -1, n)
     given_up = points.where(better[..., None], archive.gather(2, slots))
     archive = archive.scatter(2, slots, given_up)

@@ -35,11 +35,11 @@ It rises only when a plugin that keeps to the public API would have to change.
 
 def each_once(values: Values) -> Values:
     """Returns the values; raises ValueError if one stands there twice."""
-    seen: list[Any] = []
+    earlier: list[Any] = []
     for value in () if values is None else values:
-        if value in seen:
+        if value in earlier:
             raise ValueError(f"{value!r} stands there twice; write each once")
-        seen.append(value)
+        earlier.append(value)
     return values
 
 

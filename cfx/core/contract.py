@@ -61,9 +61,9 @@ def violations(
         unknown -= parameters
     if unknown:
         raise TypeError(f"no statement of this contract takes {', '.join(sorted(unknown))}")
-    for check, given in arguments.items():
+    for check, values in arguments.items():
         try:
-            check(component, **given)
+            check(component, **values)
         except NotApplicable:
             continue
         except NotInstalledError:
@@ -92,11 +92,11 @@ def expect_tensor(
     """Asserts that a component gives a tensor of a shape and a dtype."""
     import torch
 
-    given = f"a {type(value).__name__}"
+    delivered = f"a {type(value).__name__}"
     if isinstance(value, torch.Tensor):
-        given = f"the shape {tuple(value.shape)}"
+        delivered = f"the shape {tuple(value.shape)}"
     assert isinstance(value, torch.Tensor) and value.shape == shape, (  # noqa: PT018 - one sentence
-        f"{what} gives {given}; it must give {shape_in_words}, here {shape}"
+        f"{what} gives {delivered}; it must give {shape_in_words}, here {shape}"
     )
     assert value.dtype == dtype, (
         f"{what} gives {value.dtype} for {dtype}; a component computes in the dtype of what it is"

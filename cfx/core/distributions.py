@@ -105,7 +105,7 @@ def advice(group: str, name: str, available: Sequence[str]) -> str:
     Args:
         group: such as `model`.
         name: what was asked for.
-        known: the options that are installed.
+        available: the options that are installed.
     """
     options = brought()
     if (group, name) in options:

@@ -67,8 +67,8 @@ def atomic_write(path: Path) -> Iterator[Path]:
     Raises:
         OSError: the place cannot be written.
     """
-    own = f"{os.getpid()}@{_host()}-{secrets.token_hex(4)}"
-    partial = path.with_name(f".{own}.{path.name}")
+    prefix = f"{os.getpid()}@{_host()}-{secrets.token_hex(4)}"
+    partial = path.with_name(f".{prefix}.{path.name}")
     try:
         yield partial
         partial.replace(path)

@@ -200,7 +200,7 @@ class ParameterSpace:
                 _require_possible(parameter, f"{key}.low", change.low, None)
                 _require_possible(parameter, f"{key}.high", None, change.high)
                 merged.append(replace(parameter, **change.model_dump(exclude_none=True)))
-        for name, given in changes.items():
+        for name, addition in changes.items():
             if name in self._by_name:
                 continue
             if not self.open:
@@ -208,7 +208,7 @@ class ParameterSpace:
                     f"model.parameters.{name}: the model has no such parameter."
                     f"{nearest(name, self._by_name)} Known: {', '.join(self._by_name)}."
                 )
-            merged.append(_added(name, given))
+            merged.append(_added(name, addition))
         space = ParameterSpace(tuple(merged))
         if not space.parameters:
             raise ParameterError(
@@ -350,19 +350,19 @@ def _for_adaptation(parameter: Parameter, bounds: tuple[float, float] | None) ->
     )
 
 
-def _added(name: str, given: ParameterOverride) -> Parameter:
+def _added(name: str, change: ParameterOverride) -> Parameter:
     """Returns a parameter that a config adds to an open space."""
-    if given.low is None or given.high is None or given.default is None:
+    if change.low is None or change.high is None or change.default is None:
         raise ParameterError(
             f"model.parameters.{name}: give low, high and default, as nobody else knows them"
         )
-    tuned = given.tuned is not False
+    tuned = change.tuned is not False
     return Parameter(
         name,
         "",
-        given.low,
-        given.high,
-        given.default,
+        change.low,
+        change.high,
+        change.default,
         "as the model defines it",
         "configuration",
         tuned,

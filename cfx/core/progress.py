@@ -84,9 +84,9 @@ class _NotebookBar:
             if self._is_closed or now - self._drawn < _DRAW_EVERY:
                 return
             self._drawn = now
-            said = f"{100 * self._done / self._total:.0f} % after {now - self._began:.0f} s"
+            progress = f"{100 * self._done / self._total:.0f} % after {now - self._began:.0f} s"
             bar = f'<progress max="{self._total}" value="{self._done}"></progress>'
-            self._show(f"<div>{html.escape(self._description)} {bar} {said}</div>", said)
+            self._show(f"<div>{html.escape(self._description)} {bar} {progress}</div>", progress)
 
     def close(self) -> None:
         self._first.cancel()

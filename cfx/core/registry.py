@@ -645,15 +645,15 @@ def _announced(
 ) -> dict[str, tuple[Entry, ...]]:
     """Returns the entries of every entry-point group of cfx, sorted."""
     entries_by_kind: dict[str, list[Entry]] = {}
-    seen = set()
+    distributions = set()
     for distribution in importlib.metadata.distributions():
         try:
             announced = list(_entries(distribution))
         except Exception:  # noqa: S112 - metadata that cannot be read announces nothing
             continue
         # The first of a name on the search path is the one that is imported.
-        if announced and announced[0][1].distribution not in seen:
-            seen.add(announced[0][1].distribution)
+        if announced and announced[0][1].distribution not in distributions:
+            distributions.add(announced[0][1].distribution)
             for group, entry in announced:
                 entries_by_kind.setdefault(group, []).append(entry)
     by_group = {}
@@ -752,15 +752,15 @@ def _resolve(target: str) -> Any:
 
 def _without_blanks(schema: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
     """Leaves out null where a value is required, so that the error asks for one."""
-    kept: dict[str, Any] = {}
+    filled: dict[str, Any] = {}
     for key, value in values.items():
         field = schema.model_fields.get(key)
         nested: Any = None if field is None else field.annotation
         if isinstance(value, Mapping) and inspect.isclass(nested) and issubclass(nested, BaseModel):
-            kept[key] = _without_blanks(nested, value)
+            filled[key] = _without_blanks(nested, value)
         elif value is not None or field is None or not is_blank(field):
-            kept[key] = value
-    return kept
+            filled[key] = value
+    return filled
 
 
 def is_blank(field: FieldInfo) -> bool:

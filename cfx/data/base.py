@@ -297,8 +297,8 @@ class Dataset(Component):
             can_say_units=hasattr(self.settings, "units"),
         )
         left_out = frozenset(verdict.left_out)
-        kept = [pair.pair_id not in left_out for pair in selected.pairs]
-        selected = selected.select(kept, verdict.reason)
+        is_coherent = [pair.pair_id not in left_out for pair in selected.pairs]
+        selected = selected.select(is_coherent, verdict.reason)
         if isinstance(self.settings, FileDatasetSettings):
             selected = with_usable_accelerations(selected, self.settings.accelerations)
         return scaled(selected, self.settings.scale)
@@ -397,13 +397,13 @@ def _compact(files: Iterable[PairSet]) -> list[PairSet]:
 
 def _require_different(parts: Sequence[PairSet]) -> None:
     """Raises DataError if a pair stands in two of the files."""
-    seen: dict[str, tuple[str, str]] = {}
+    sources: dict[str, tuple[str, str]] = {}
     for part in parts:
         here: dict[str, tuple[str, str]] = {}
         for pair in part:
             for key in (pair.pair_id, pair.content):
-                if key in seen:
-                    source, name = seen[key]
+                if key in sources:
+                    source, name = sources[key]
                     there = ""
                     if name != pair.pair_id:
                         there = f", there '{pair.pair_id}',"
@@ -412,7 +412,7 @@ def _require_different(parts: Sequence[PairSet]) -> None:
                         " leave it out of one of them"
                     )
                 here[key] = (part.source, pair.pair_id)
-        seen |= here
+        sources |= here
 
 
 _NOUNS = {
@@ -487,11 +487,11 @@ def _selected(pairs: PairSet, name: str, setting: Any) -> PairSet:
 
 def _select_long(pairs: PairSet, min_duration: float) -> PairSet:
     """Keeps the pairs that last at least so many seconds, and warns of the others."""
-    kept, durations = [], []
+    is_long, durations = [], []
     for pair in pairs:
-        kept.append(pair.lasts(min_duration))
+        is_long.append(pair.lasts(min_duration))
         durations.append(pair.duration)
-    long = pairs.select(kept, f"shorter than {min_duration:g} s")
+    long = pairs.select(is_long, f"shorter than {min_duration:g} s")
     if not len(long):
         longest = max(durations)
         raise DataError(

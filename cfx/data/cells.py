@@ -174,7 +174,9 @@ class Written:
 
     def _mark_beside(self, marks: Sequence[str]) -> str:
         """Returns the decimal mark of a column whose cells leave it open."""
-        open_to = {mark: np.flatnonzero(self.marks_thousands[mark]) for mark in _MARKS}
+        open_to = {}
+        for mark in _MARKS:
+            open_to[mark] = np.flatnonzero(self.marks_thousands[mark])
         if not len(open_to["."]) and not len(open_to[","]):
             return "."  # whole numbers
         if len(open_to["."]) and len(open_to[","]):
@@ -469,8 +471,10 @@ def names_in(column: Any) -> NameColumn:
         written.append(name_of(cell) or None)
     named = [name for name in written if name is not None]
     if len(named) > 1 and all(_WITH_ZEROS.fullmatch(name) for name in named):
-        # All of several ids are no multiples of 1000: the comma marks decimals.
-        written = [None if name is None else name.partition(",")[0] for name in written]
+        # Several ids will not all be multiples of 1000: the comma marks decimals.
+        for number, name in enumerate(written):
+            if name is not None:
+                written[number] = name.partition(",")[0]
     merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
     with_missing = np.append(merged, -1).astype(np.int64)
     return NameColumn(with_missing[codes], list(names))

@@ -140,11 +140,11 @@ def check_pairs(
 def _without(pairs: PairSet, names: Sequence[str]) -> PairSet:
     """Returns the pairs that are not named."""
     left_out = frozenset(names)
-    kept = []
+    coherent = []
     for number, pair in enumerate(pairs.pairs):
         if pair.pair_id not in left_out:
-            kept.append(number)
-    return pairs.take(kept)
+            coherent.append(number)
+    return pairs.take(coherent)
 
 
 def _of_pairs(

@@ -138,8 +138,8 @@ def describe(
     pieces += ["", heading]
     for sentence in problems:
         pieces.append(f"  {sentence}")
-    more, kept = _advice(_lengths(contents.pairs), dataset.settings.min_duration)
-    pieces += ["", reader.use(path) + more, *kept]
+    more, sentences = _advice(_lengths(contents.pairs), dataset.settings.min_duration)
+    pieces += ["", reader.use(path) + more, *sentences]
     return Description(_text(pieces), contents.pairs)
 
 
@@ -302,12 +302,12 @@ def _describe_partitions(folder: Path, reader: _Reader) -> str:
         cells = _grouped_digits(counts)
         table.add_row(str(file.relative_to(folder)), listed(sorted(recordings), 2), *cells)
     table.add_row("all", f"{len(names):,}", *_grouped_digits(totals))
-    more, kept = _advice(lengths, dataset.settings.min_duration)
+    more, sentences = _advice(lengths, dataset.settings.min_duration)
     layout = f"{dataset.layout}, {len(files)} files, read one after the other"
     one_file = "A recording alone: python -m cfx data describe FILE"
     one_recording = "One recording of it: data.recording=NAME"
     use = reader.use(folder) + more
-    return _text([str(folder), "", layout, "", table, "", one_file, use, *kept, one_recording])
+    return _text([str(folder), "", layout, "", table, "", one_file, use, *sentences, one_recording])
 
 
 def _grouped_digits(counts: Ints) -> list[str]:
@@ -455,12 +455,12 @@ def _advice(pairs: Sequence[tuple[int, float]], usual: float) -> tuple[str, list
         if least > _ROUND_S:
             least = least // _ROUND_S * _ROUND_S
         options += f" data.min_duration={least:g}"
-    kept = np.count_nonzero(durations >= least - _ROUNDING_S)
-    if kept == len(durations):
-        return options, [f"It keeps all {kept:,} pairs."]
+    long = np.count_nonzero(durations >= least - _ROUNDING_S)
+    if long == len(durations):
+        return options, [f"It keeps all {long:,} pairs."]
     shortest = rounded_down(float(durations[0]))
     return options, [
-        f"It keeps {kept:,} of {len(durations):,} pairs and leaves out {len(durations) - kept:,}"
+        f"It keeps {long:,} of {len(durations):,} pairs and leaves out {len(durations) - long:,}"
         f" shorter than {least:g} s; data.min_duration={shortest:g} keeps all."
     ]
 
@@ -581,7 +581,10 @@ def _quantities(pairs: PairSet) -> Iterator[tuple[str, Floats]]:
 
 
 def _counts(counts: Sequence[Dropped]) -> list[str]:
-    return [f"  {dropped.count:,} {dropped.unit}: {dropped.reason}" for dropped in counts]
+    lines = []
+    for dropped in counts:
+        lines.append(f"  {dropped.count:,} {dropped.unit}: {dropped.reason}")
+    return lines
 
 
 def _suspicions(contents: Contents, check: Check, units: Mapping[str, str]) -> Iterator[str]:

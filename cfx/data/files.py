@@ -432,13 +432,13 @@ def are_partitions(path: Path) -> bool:
 
 def _parquet_files(folder: Path) -> Iterator[Path]:
     """Yields the parquet files below a folder; folders that are links count, each once."""
-    seen = set()
+    visited = set()
     for place, below, names in os.walk(folder, followlinks=True):
         home = os.path.realpath(place)
-        if home in seen:
+        if home in visited:
             below.clear()
             continue
-        seen.add(home)
+        visited.add(home)
         below.sort()
         for name in names:
             file = Path(place, name)

@@ -181,8 +181,7 @@ def _of_several(sources: Iterable[Any]) -> Frame | None:
     sources = list(sources)
     if not sources:
         return None
-    rows = [isinstance(source, Mapping) and _is_row(source) for source in sources]
-    if all(rows):
+    if all(_is_row(source) for source in sources):
         return _of_pandas(pd.DataFrame(sources))
     frames = [frame_of_source(source) for source in sources]
     tables = [frame for frame in frames if frame is not None]
@@ -204,11 +203,14 @@ def _of_several(sources: Iterable[Any]) -> Frame | None:
     return Frame(list(names), column, tables[0].advice)
 
 
-def _is_row(mapping: Mapping[Any, Any]) -> bool:
-    """Says whether a mapping is a row: its values are no columns."""
-    return not any(
-        isinstance(value, Iterable) and not isinstance(value, str) for value in mapping.values()
-    )
+def _is_row(source: object) -> bool:
+    """Says whether a source is one row: a mapping whose values are no columns."""
+    if not isinstance(source, Mapping):
+        return False
+    for value in source.values():
+        if isinstance(value, Iterable) and not isinstance(value, str):
+            return False
+    return True
 
 
 def _one_column(tables: list[Frame], name: str) -> Any:
@@ -301,8 +303,10 @@ def _mixes(series: pd.Series) -> bool:
     """Says whether some cells are text and others numbers: Arrow wants one type, as files have."""
     if not pd.api.types.infer_dtype(series, skipna=True).startswith("mixed"):
         return False
-    kinds = {type(cell) for cell in series.dropna()}
-    return all(issubclass(kind, str | int | float | np.number) for kind in kinds)
+    for kind in {type(cell) for cell in series.dropna()}:
+        if not issubclass(kind, str | int | float | np.number):
+            return False
+    return True
 
 
 def _type_of(series: pd.Series) -> str:

@@ -306,7 +306,7 @@ class Contradiction:
         read_in = _units_of(self.signals.partition("_")[0], units)
         room = _SAME
         if self.quantity == "gap":
-            said = f"the gap changes {slope:.3g} times as the relative speed says"
+            finding = f"the gap changes {slope:.3g} times as the relative speed says"
             explanations = {-1.0: "the leader's and the follower's columns look swapped"}
             explanations |= _factors(read_in, slower=("gap",), faster=("speed",))
             otherwise = (
@@ -315,20 +315,20 @@ class Contradiction:
             )
             room = _SAME_GAP
         elif self.quantity == "speed":
-            said = f"speeds change {slope:.3g} times as much as the accelerations say"
+            finding = f"speeds change {slope:.3g} times as much as the accelerations say"
             if other is not None and abs(other - 1) > _TYPICAL and abs(slope / other - 1) < _SAME:
-                return f"{said}, and positions as much more than the speeds say, so {step}"
+                return f"{finding}, and positions as much more than the speeds say, so {step}"
             explanations = _ACCELERATION_FACTORS | _factors(
                 read_in, faster=("acceleration",), slower=("speed",)
             )
             otherwise = f"they are {1 / slope:.2g} times what the speeds say; write m/s2"
         else:
-            said = f"the distance driven is {slope:.3g} times speed times time"
+            finding = f"the distance driven is {slope:.3g} times speed times time"
             if slope < 0:
-                return f"{said}: positions must grow along the lane"
+                return f"{finding}: positions must grow along the lane"
             if other is not None and abs(other / slope - 1) < _SAME:
-                said += ": speeds change as much faster than the accelerations say"
-                return f"{said}, so {step}"
+                finding += ": speeds change as much faster than the accelerations say"
+                return f"{finding}, so {step}"
             explanations = _factors(read_in, faster=("speed", "time"), slower=("position",))
             otherwise = (
                 f"positions must be in {read_in['position']}, speeds in {read_in['speed']}, times"
@@ -336,8 +336,8 @@ class Contradiction:
             )
         nearest = min(explanations, key=lambda expected: abs(slope / expected - 1))
         if abs(slope / nearest - 1) < room:
-            return f"{said}: {explanations[nearest]}"
-        return f"{said}: {otherwise}"
+            return f"{finding}: {explanations[nearest]}"
+        return f"{finding}: {otherwise}"
 
 
 class _Relation(NamedTuple):

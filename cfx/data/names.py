@@ -55,11 +55,11 @@ def names_of(values: object) -> list[str]:
 
 def named_twice(names: Sequence[str]) -> str | None:
     """Returns the first name that stands twice in a list; None if each stands there once."""
-    seen: set[str] = set()
+    earlier: set[str] = set()
     for name in names:
-        if name in seen:
+        if name in earlier:
             return name
-        seen.add(name)
+        earlier.add(name)
     return None
 
 

@@ -328,11 +328,11 @@ class PairSet(Sequence[Pair]):
     remarks: tuple[Remark, ...] = ()
 
     def __post_init__(self) -> None:
-        seen: set[str] = set()
+        ids: set[str] = set()
         for pair in self.pairs:
-            if pair.pair_id in seen:
+            if pair.pair_id in ids:
                 raise DataError(f"{self.source}: pair id '{pair.pair_id}' stands for two pairs")
-            seen.add(pair.pair_id)
+            ids.add(pair.pair_id)
 
     @property
     def ids(self) -> list[str]:
@@ -417,11 +417,11 @@ class PairSet(Sequence[Pair]):
 
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:
         """Keeps the pairs marked True and counts the others under `reason`."""
-        kept = tuple(itertools.compress(self.pairs, keep))
+        selected = tuple(itertools.compress(self.pairs, keep))
         dropped = self.dropped
-        if len(kept) < len(self.pairs):
-            dropped = (*dropped, Dropped(reason, len(self.pairs) - len(kept)))
-        return replace(self, pairs=kept, dropped=dropped)
+        if len(selected) < len(self.pairs):
+            dropped = (*dropped, Dropped(reason, len(self.pairs) - len(selected)))
+        return replace(self, pairs=selected, dropped=dropped)
 
     @property
     def dt(self) -> float:

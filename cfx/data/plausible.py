@@ -41,7 +41,9 @@ def doubts(pairs: PairSet) -> Iterator[str]:
     if length > _LONG_M:
         yield f"leaders are typically {length:.1f} m long: feet, or lorries only?"
     if len(pairs) >= _MANY:
-        nine_tenths = [np.quantile(np.abs(pair.follower_acceleration), 0.9) for pair in pairs]
+        nine_tenths = []
+        for acceleration in of_each(pairs, "follower_acceleration"):
+            nine_tenths.append(np.quantile(np.abs(acceleration), 0.9))
         harsh = float(np.median(nine_tenths))
         if harsh > _HARSH_MPS2:
             yield (
@@ -85,7 +87,8 @@ def rare(pairs: PairSet) -> Iterator[str]:
             yield f"{counted}: {advice}"
     backwards = list(_counted(pairs, "steps in which a vehicle moves backwards", _goes_back))
     for counted in backwards:
-        if all(follows_from_gaps(pair) for pair in pairs if _goes_back(pair).any()):
+        backing = [pair for pair in pairs if _goes_back(pair).any()]
+        if all(follows_from_gaps(pair) for pair in backing):
             yield (
                 f"{counted}: positions follow from the leader's speed and the gap here, so this is"
                 " the noise of the gap while vehicles stand or creep, and no contradiction; use it"

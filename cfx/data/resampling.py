@@ -28,12 +28,12 @@ def resampled(pairs: PairSet, step: float) -> PairSet:
     Args:
         step: s.
     """
-    kept = pairs.changed(lambda pair: _pair(pair, step))
-    lost = len(pairs) - len(kept)
+    resampled_pairs = pairs.changed(lambda pair: _pair(pair, step))
+    lost = len(pairs) - len(resampled_pairs)
     if not lost:
-        return kept
+        return resampled_pairs
     dropped = Dropped(f"shorter than two steps of {step:g} s", lost)
-    return replace(kept, dropped=(*pairs.dropped, dropped))
+    return replace(resampled_pairs, dropped=(*pairs.dropped, dropped))
 
 
 def frames_in_steps(frames: int, dt: float, step: float) -> int:

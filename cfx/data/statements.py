@@ -122,16 +122,16 @@ def _remark_of(statement: Statement) -> Remark | None:
     )
 
 
-def _compared(said: Floats, follows: Floats, resolution: float) -> _Comparison | None:
+def _compared(stated: Floats, follows: Floats, resolution: float) -> _Comparison | None:
     """Compares a column with what follows for it; None where too few rows say something."""
-    says = np.isfinite(said) & np.isfinite(follows) & (said != 0) & (follows != 0)
+    says = np.isfinite(stated) & np.isfinite(follows) & (stated != 0) & (follows != 0)
     rows = np.flatnonzero(says)
     if len(rows) < _LEAST:
         return None
     rows = rows[:: -(-len(rows) // _LOOKED_AT)]
-    said, follows = said[rows], follows[rows]
-    ratio = said / follows
-    agrees = (np.abs(said - follows) <= resolution) | (np.abs(ratio - 1) <= _ROOM)
+    stated, follows = stated[rows], follows[rows]
+    ratio = stated / follows
+    agrees = (np.abs(stated - follows) <= resolution) | (np.abs(ratio - 1) <= _ROOM)
     logs = np.log(np.abs(ratio))
     median = float(np.median(logs))
     steady = np.abs(logs - median) <= _ROOM

@@ -54,9 +54,10 @@ class SteadyFollowing(NamedTuple):
     """Mean steady following of each pair in each range of speed, `(P, K)` each.
 
     Attributes:
-        speed: m/s; NaN where a pair followed steadily for less than `LEAST_S`, as the gap.
-        gap: bumper to bumper, m.
-        seconds: how long each followed steadily.
+        speed: mean speed, m/s.
+        gap: mean gap, bumper to bumper, m. Speed and gap are NaN where a pair followed steadily for
+            less than `LEAST_S`.
+        seconds: how long each pair followed steadily.
     """
 
     speed: Tensor
@@ -68,12 +69,12 @@ class GapRelation(NamedTuple):
     """The gap that drivers keep, by speed: a row for each range with enough of them, `(K,)` each.
 
     Attributes:
-        speed: m/s, in the mean.
-        gap: that of the mean spacing, bumper to bumper, m: a lane with all these drivers has that
-            flow.
-        low, median, high: 25, 50 and 75 % of drivers' gaps, each moved to that speed at the
-            driver's own time headway, m.
-        drivers: how many there are.
+        speed: mean speed of the drivers in the range, m/s.
+        gap: mean time headway times that speed, minus a vehicle's length: the gap, bumper to
+            bumper, of a lane that holds all these drivers, m.
+        low, median, high: quartiles of the gaps that drivers keep at that speed, each at their own
+            time headway, m.
+        drivers: how many drivers the range has.
     """
 
     speed: Floats
@@ -95,7 +96,7 @@ class GapRelation(NamedTuple):
 
 
 def flow(speed: Floats, gap: Floats) -> Floats:
-    """Returns the flow of vehicles that all drive at a speed, m/s, and a gap, m: vehicles/h."""
+    """Returns the flow, vehicles/h, of a lane in which all drive at this speed, m/s, and gap, m."""
     return 3600.0 * speed / (gap + VEHICLE_M)
 
 
@@ -135,7 +136,9 @@ def relation_of(
 ) -> GapRelation:
     """Returns the relation of speed and gap of some drivers.
 
-    Drivers of one range differ in speed, so their time headways (front to front) are compared.
+    Within a range of speed the faster drivers have the larger gaps. Time headways (front to front,
+    the spacing over the speed) hardly depend on speed there, so quartiles and means are taken over
+    them, and become gaps at the range's mean speed.
 
     Args:
         following: of P pairs.
@@ -158,6 +161,7 @@ def relation_of(
             headway, (0.25, 0.5, 0.75), method="inverted_cdf", weights=shares[measured]
         )
         mean = float(np.average(headway, weights=shares[measured]))
+        # A lane's flow is 1 / (mean time headway), which no mean of gaps would give.
         gaps_there = np.array([mean, *quartiles]) * mean_speed - VEHICLE_M
         rows.append((mean_speed, *gaps_there.tolist(), listed))
     speed, gap, low, median, high, count = np.array(rows, dtype=np.float64).reshape(-1, 6).T
@@ -193,8 +197,11 @@ def relation_from(table: Mapping[str, Sequence[float]]) -> GapRelation:
     Raises:
         KeyError: a column is missing.
     """
-    speed, gap, low, median, high = (
-        np.asarray(table[name], dtype=np.float64) for name in GapRelation._fields[:-1]
+    return GapRelation(
+        speed=np.asarray(table["speed"], dtype=np.float64),
+        gap=np.asarray(table["gap"], dtype=np.float64),
+        low=np.asarray(table["low"], dtype=np.float64),
+        median=np.asarray(table["median"], dtype=np.float64),
+        high=np.asarray(table["high"], dtype=np.float64),
+        drivers=np.asarray(table["drivers"], dtype=np.int64),
     )
-    drivers = np.asarray(table["drivers"], dtype=np.int64)
-    return GapRelation(speed, gap, low, median, high, drivers)

@@ -50,7 +50,7 @@ _PAIRS_AT_ONCE = 4096
 
 
 class Indicator(NamedTuple):
-    """A column of the evaluation matrix; `sign` is +1 if more of it is more aggressive, else -1."""
+    """A measure of a driver's style; `sign` is +1 if a larger value is more aggressive, else -1."""
 
     name: str
     sign: int
@@ -65,7 +65,7 @@ INDICATORS = (
     Indicator("mean_space_headway", -1, "m"),
     Indicator("mean_time_headway", -1, "s"),
 )
-"""What a driver's style is scored by: columns of the evaluation matrix, in their order."""
+"""What a driver's style is scored by, in the order of the columns of the evaluation matrix."""
 
 
 INDICATOR_NAMES = [indicator.name for indicator in INDICATORS]
@@ -81,11 +81,12 @@ CLUSTERS = ("conservative", "normal", "aggressive")
 """Names of the clusters 0, 1, 2: the bottom quarter, the middle half, the top quarter of scores."""
 
 STANDING_MPS = 0.5
-"""Below this speed a vehicle stands: its time headway, headway over speed, says nothing."""
+"""Below this speed a vehicle counts as standing. Its time headway, the space headway over the
+speed, would grow beyond all bounds, and is left out."""
 
 
 BETWEEN = "; "
-"""What stands between the sites of a driver who was recorded at several."""
+"""Separates the sites of a driver who was recorded at several."""
 
 
 class StyleSettings(Settings):
@@ -219,7 +220,7 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
 
 
 def _by_driver(pairs: PairSet) -> Iterator[list[Pair]]:
-    """Yields the pairs of some drivers, then of some others: frames of all need much memory."""
+    """Yields the pairs of a few drivers at a time: the frames of all at once need much memory."""
     of_driver: dict[str, list[int]] = {}
     for index, pair in enumerate(pairs.pairs):
         of_driver.setdefault(pair.driver, []).append(index)
@@ -327,15 +328,16 @@ def entropy_weights(normalised: Floats) -> Floats:
 # --- sites ----------------------------------------------------------------------------------------
 
 ALL_TYPES = "all"
-"""The drivers of a site whatever drives."""
+"""The `driver_type` of a group that holds all drivers of a site."""
 
 NOT_KNOWN = "not known"
-"""What stands for a type of driver that the recording does not tell."""
+"""The `driver_type` of a group whose recording does not say what drives."""
 
 _FEWEST = 2
-"""Drivers of a group that distances are computed for."""
+"""A group needs at least as many drivers for its distances to be computed."""
 
 _PERMUTATIONS = 999
+"""Of the drivers of two groups, at most: no p-value is below 1 / (this + 1)."""
 
 
 class Group(NamedTuple):
@@ -429,10 +431,11 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
     """Measures how far apart sites are, and types of drivers within a site.
 
     The distance is the energy distance between the distributions of the drivers' scores (G. J.
-    Székely, M. L. Rizzo: Energy statistics, 2013), here in one dimension; its p-value is that of a
-    permutation of the drivers, corrected for the number of comparisons (Benjamini, Hochberg). The
-    distance of an indicator is that of its normalised values times its weight, so that those of all
-    six compare; `most` names the largest.
+    Székely, M. L. Rizzo: Energy statistics, 2013), here in one dimension. Its p-value comes from
+    permutations of the drivers between the two groups, and is corrected for the number of
+    comparisons (Benjamini, Hochberg). The distance of each indicator is computed in the same way
+    from its normalised values times its weight, which makes the six distances comparable; `most`
+    names the indicator with the largest.
 
     Returns:
         A row per two groups: site, driver_type, other_site, other_driver_type, distance, p_value,
@@ -450,6 +453,7 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
     score = style.table["score"].to_numpy(dtype=np.float64)
     rows: list[dict[str, object]] = []
     for group, other in compared:
+        # A driver of both sites says nothing about their difference.
         first, second = group.chosen & ~other.chosen, other.chosen & ~group.chosen
         if min(first.sum(), second.sum()) < _FEWEST:
             continue
@@ -460,15 +464,15 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
             alternative="greater",
             rng=np.random.default_rng(0),
         )
-        of_each = {}
+        distances = {}
         for indicator, values in zip(INDICATORS, weighted.T, strict=True):
             distance = stats.energy_distance(values[first], values[second])
-            of_each[f"distance_{indicator.name}"] = float(distance)
-        most = max(of_each, key=of_each.__getitem__).removeprefix("distance_")
+            distances[f"distance_{indicator.name}"] = float(distance)
+        most = max(distances, key=distances.__getitem__).removeprefix("distance_")
         row: dict[str, object] = {"site": group.site, "driver_type": group.driver_type}
         row |= {"other_site": other.site, "other_driver_type": other.driver_type}
         row |= {"distance": float(tested.statistic), "p_value": float(tested.pvalue), "most": most}
-        rows.append(row | of_each)
+        rows.append(row | distances)
     if not rows:
         return None
     table = pd.DataFrame(rows)
@@ -477,7 +481,7 @@ def style_distances(style: StyleResult) -> pd.DataFrame | None:
 
 
 def _compared(drivers: pd.DataFrame) -> Iterator[tuple[Group, Group]]:
-    """Yields each two sites, then each two types of drivers of a site."""
+    """Yields every pair of sites, then every pair of types of drivers within one site."""
     sites, types = [], []
     for group in groups(drivers):
         if group.driver_type == ALL_TYPES:

@@ -320,11 +320,11 @@ class Table:
         return self.numbers[column].astype(np.int64)
 
 
-def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = None) -> Table:
+def read_table(path: Path, layout: Layout, labels: Mapping[str, str] | None = None) -> Table:
     """Reads the columns of a layout from a text or a parquet file, and checks every cell.
 
     Args:
-        given: a name for each column of names that a parquet file may lack: its cells all hold it.
+        labels: a name for each column of names that a parquet file may lack: its cells all hold it.
 
     Raises:
         DataError: the file cannot be read, a column is missing, or a cell is wrong; the message
@@ -341,7 +341,7 @@ def read_table(path: Path, layout: Layout, given: Mapping[str, str] | None = Non
     try:
         file = pq.ParquetFile(parquet_source(path))
         stored = file.schema_arrow.names
-        more = dict(given or {})
+        more = dict(labels or {})
         for name in stored:
             more.pop(name, None)
         matches = layout.found_in(str(path), [*stored, *more])
@@ -619,8 +619,8 @@ def _parsed(text: _Text, matches: Mapping[str, _Found], number_type: Any, spare:
                     f"{text.path}, row {row + text.skipped + 1}: '{cell}' stands behind the"
                     f" last of {len(text.names)} columns; does a cell hold a separator?"
                 )
-    kept = {f"c{match.at}": text.names[match.at] for match in matches.values()}
-    return table.select(list(kept)).rename_columns(list(kept.values()))
+    titles = {f"c{match.at}": text.names[match.at] for match in matches.values()}
+    return table.select(list(titles)).rename_columns(list(titles.values()))
 
 
 class _Tabs(io.RawIOBase):

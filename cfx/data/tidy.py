@@ -246,15 +246,16 @@ class TidySettings(FileDatasetSettings):
         for name, plain in COLUMNS.items():
             by_name[plain] = self._own(name, by_name[plain])
         settings = {plain: name for name, plain in COLUMNS.items()}
-        seen: dict[str, str] = {}
+        quantities: dict[str, str] = {}
         for column in by_name.values():
             quantity = settings.get(column.name, column.name)
-            if column.title in seen:
+            if column.title in quantities:
+                other = quantities[column.title]
                 raise ValueError(
-                    f"data.columns: the column {column.title} would be both {seen[column.title]}"
+                    f"data.columns: the column {column.title} would be both {other}"
                     f" and {quantity}; name another one"
                 )
-            seen[column.title] = quantity
+            quantities[column.title] = quantity
         columns = []
         for column in by_name.values():
             unless = ""
@@ -278,8 +279,8 @@ class TidySettings(FileDatasetSettings):
         """Returns the unit that the file has for a quantity in place of the layout's; or None."""
         if getattr(self.columns, name) is None:
             return None
-        own: str | None = getattr(self.units, name, None)
-        return own or getattr(self.units, name.removeprefix("leader_"), None)
+        unit: str | None = getattr(self.units, name, None)
+        return unit or getattr(self.units, name.removeprefix("leader_"), None)
 
     def _own(self, name: str, column: FileColumn) -> FileColumn:
         """Returns a column with the name and the unit that the file has for it."""
@@ -392,10 +393,10 @@ def read_tidy(path: Path, layout: Layout = LAYOUT, signals: Sequence[Signal] = (
         DataError: the file cannot be read or does not keep to the layout.
     """
     recording = recording_of(path)
-    given = {}
+    labels = {}
     if recording is not None:
-        given["recording"] = recording
-    return _pairs(read_table(path, _with_signals(layout, signals), given), signals)
+        labels["recording"] = recording
+    return _pairs(read_table(path, _with_signals(layout, signals), labels), signals)
 
 
 def pairs_from_frame(
@@ -623,7 +624,10 @@ def _as_table(
         if name in optional:
             columns[name] = per_pair(of_each(pairs, attribute), pa.string())
     for name in truths:
-        values = [pair.truth.get(name, np.full(len(pair), np.nan)) for pair in pairs]
+        values = []
+        for pair in pairs:
+            unknown = np.full(len(pair), np.nan)
+            values.append(pair.truth.get(name, unknown))
         columns[TRUE + name] = _over_time(values)
     for signal in signals:
         columns[signal.column] = _over_time([pair.surroundings[signal] for pair in pairs])

@@ -201,10 +201,13 @@ def check_gap(table: Table, pairs: Sequence[Pair]) -> None:
     if not len(at):
         return
     name = table.labels["pair_id"].at(int(at[0]))
-    why = next((contradiction(pair) for pair in pairs if pair.pair_id == name), None)
     remedy = f"cut the pair there, or correct positions and {table.title(LENGTH)}"
-    if why is not None:
-        remedy = f"perhaps this is why: {why.text()}"
+    for pair in pairs:
+        if pair.pair_id == name:
+            why = contradiction(pair)
+            if why is not None:
+                remedy = f"perhaps this is why: {why.text()}"
+            break
     raise DataError(
         f"{table.at(at[0])}: the leader is behind its follower, or overlaps it: the gap is"
         f" {gap[at[0]]:.2f} m ({len(at)} such rows); {remedy}"

@@ -471,14 +471,14 @@ def _build(follower: Tracks, leader: Tracks, gap: Floats, starts: Ints, sizes: I
     if follower.gap is not None:
         position = leader.position - leader.length - gap
     pairs: list[Pair] = []
-    seen: dict[str, int] = {}
+    runs: dict[str, int] = {}
     for start, size in zip(starts.tolist(), sizes.tolist(), strict=True):
         run = slice(start, start + size)
         recording = follower.recordings[follower.recording[start]]
         leader_id = leader.name(int(leader.vehicle[start]))
         follower_id = follower.name(int(follower.vehicle[start]))
         pair = Pair(
-            pair_id=unique_name(f"{recording}-{follower_id}-{leader_id}", seen),
+            pair_id=unique_name(f"{recording}-{follower_id}-{leader_id}", runs),
             recording=recording,
             leader_id=leader_id,
             follower_id=follower_id,
@@ -499,15 +499,15 @@ def _build(follower: Tracks, leader: Tracks, gap: Floats, starts: Ints, sizes: I
     return pairs
 
 
-def unique_name(name: str, seen: dict[str, int]) -> str:
+def unique_name(name: str, runs: dict[str, int]) -> str:
     """Returns a pair's id; the second one of a name ends with -run2.
 
     Args:
-        seen: how often each name was given; this call counts too.
+        runs: how often each name was given; this call counts too.
     """
-    seen[name] = seen.get(name, 0) + 1
-    if seen[name] > 1:
-        return f"{name}-run{seen[name]}"
+    runs[name] = runs.get(name, 0) + 1
+    if runs[name] > 1:
+        return f"{name}-run{runs[name]}"
     return name
 
 

@@ -135,15 +135,15 @@ def simulate_closed_loop(
     outside = torch.zeros(parameters.shape[:2], dtype=torch.bool, device=parameters.device)
     beyond = torch.zeros(state.beyond.shape[1], dtype=torch.float64, device=parameters.device)
     _, _, counted = track.result()
-    own: Mapping[str, Tensor] = {}
+    driver_specific: Mapping[str, Tensor] = {}
     if followers.own is not None:
-        own = agent.space.unpack(agent.core.head.completed(followers.own.values))
+        driver_specific = agent.space.unpack(agent.core.head.completed(followers.own.values))
     for begin in range(0, track.steps, agent.windows.stride):
         end = min(begin + agent.windows.stride, track.steps)
         chosen, state = agent.act(track.history(begin), state, generator)
         p = agent.space.unpack(chosen)
         if followers.own is not None:
-            p = for_both(p, own, followers.own.weight)
+            p = for_both(p, driver_specific, followers.own.weight)
         follower, positions, speeds = stepper.advance(follower, track.leader(begin, end), p)
         track.write(begin, end, positions.T, speeds.T, stepper.dt)
         simulated = slice(begin + 1, end + 1)
@@ -227,8 +227,8 @@ class _Track:
             "gap": self._gap[:, recent],
         }
         for signal, stored in self._surroundings.items():
-            seen = signal.seen_from(self._position[:, recent], stored[:, recent])
-            history[signal.name] = seen
+            values = signal.seen_from(self._position[:, recent], stored[:, recent])
+            history[signal.name] = values
         return history
 
     def leader(self, begin: int, end: int) -> Leader:

@@ -18,6 +18,7 @@ from torch import Tensor
 from cfx.core import memory
 from cfx.core.distributions import OWN
 from cfx.core.parameters import ParameterSpace
+from cfx.core.registry import Installed
 from cfx.data.pairs import PairBatch, PairSet
 from cfx.data.style import CLUSTERS, StyleResult
 from cfx.errors import in_words
@@ -25,10 +26,11 @@ from cfx.evaluation.closed_loop import PAIRS_AT_ONCE, ClosedLoop
 from cfx.evaluation.metrics.base import (
     RECORDED,
     LeftOut,
-    MeasuredMetric,
+    Metric,
     MetricInfo,
     MetricSet,
     Trajectories,
+    info_of,
     leave_out,
 )
 from cfx.evaluation.metrics.errors import RmseGap, RmseSpeed
@@ -330,18 +332,20 @@ class _Measures:
                 measured[key] = np.concatenate(parts)
         infos = []
         for metric in self._metrics:
-            infos.append(metric.info(self._scopes, judges=metric.name == self._judge))
+            infos.append(info_of(metric, self._scopes, judges=metric.name == self._judge))
         return measured, tuple(infos), tuple(self._left_out)
 
 
 @torch.no_grad()
-def _values(metric: MeasuredMetric, scopes: Mapping[str, Mapping[str, Trajectories]]) -> Measured:
+def _values(
+    metric: Installed[Metric], scopes: Mapping[str, Mapping[str, Trajectories]]
+) -> Measured:
     measured: Measured = {}
     for scope, by_method in scopes.items():
         for method, trajectories in by_method.items():
-            if method == RECORDED and (scope != "test" or not metric.metric.is_of_recording):
+            if method == RECORDED and (scope != "test" or not metric.component.is_of_recording):
                 continue
-            values = metric.metric.compute(trajectories)
+            values = metric.component.compute(trajectories)
             if values.shape != (len(trajectories),):
                 raise ValueError(f"compute gives the shape {tuple(values.shape)}, not (pairs,)")
             # Where no frame counts nothing is defined, a count of zero neither.

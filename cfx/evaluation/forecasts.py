@@ -163,8 +163,10 @@ def sample_from_origins(
         if followers.history is None and not agent.core.driver_features:
             state = _observed(agent, followers, shard)
         part = _with_future(batch[shard.pair], shard.frame, steps, leader)
-        own = None if base is None else base[shard.pair]
-        followers_here = Followers(part, followers.network[shard.pair], own, followers.history)
+        base_of_origin = None if base is None else base[shard.pair]
+        followers_here = Followers(
+            part, followers.network[shard.pair], base_of_origin, followers.history
+        )
         index = shard.frame[:, None] + torch.arange(steps + 1, device=shard.frame.device)
         index = index.clamp(max=part.mask.shape[1] - 1)
         leader_position = part.leader_position.gather(1, index)
@@ -206,8 +208,8 @@ def _observed(agent: Agent, followers: Followers, origins: Origins) -> AgentStat
 
 def _begun(agent: Agent, followers: Followers, pairs: Tensor) -> AgentState:
     """Returns the state of drivers of some pairs before their first window."""
-    own = None if followers.base is None else followers.base[pairs]
-    return agent.begin(followers.network[pairs], DriverContext(own))
+    base = None if followers.base is None else followers.base[pairs]
+    return agent.begin(followers.network[pairs], DriverContext(base))
 
 
 def _shards(agent: Agent, batch: PairBatch, origins: Origins) -> Iterator[Origins]:

@@ -41,15 +41,15 @@ LENGTH = 5.0
 """m, of every vehicle."""
 
 START_HEADWAY = 2.0
-"""s: the gap of every follower at the start, as a time at the common speed. From there each settles
-as its method has it."""
+"""s: time gap of every follower at the start, at the leader's speed. During `Manoeuvre.settle` each
+moves from there to the gap that its own parameters ask for."""
 
 TOLERANCE = 0.1
 """m/s: how much more than the vehicle ahead a vehicle may slow down in a string stable platoon."""
 
 CALM = 0.5
-"""m/s: how much a speed may differ from the leader's in a platoon that has settled. Wiedemann's
-models never stop oscillating."""
+"""m/s: how much speeds may differ from the leader's in a platoon that has settled. It is not
+smaller because Wiedemann's models oscillate about the leader's speed for ever."""
 
 SETTLED_FOR = 5.0
 """s before the leader brakes, in which speeds of a settled platoon are near the leader's."""
@@ -100,7 +100,7 @@ class _Road:
         self.acceleration[..., 0] = 0.0
         self.speed[0] = leader_speed
         self.acceleration[0, :, 1:] = leader_speed.diff() / dt
-        # As the followers' own: x' = x + v' dt.
+        # Integrated as followers are, by the new speed: x' = x + v' dt.
         travelled = (leader_speed[1:] * dt).cumsum(0)
         self.position[0] = torch.cat([leader_speed.new_zeros(1), travelled])
 
@@ -133,9 +133,9 @@ class _Road:
         self.acceleration[1:, :, frame] = follower.acceleration.view(VEHICLES, -1)
 
     def history(self, frame: int, length: int, platoons: slice) -> History:
-        """Returns the last frames that each follower of some platoons has seen, `(V n, length)`.
+        """Returns the last frames that followers of n platoons have seen, `(V n, length)` each.
 
-        The first frame stands for those before it.
+        Before the start there is none: the first frame stands for those.
         """
         index = torch.arange(frame - length + 1, frame + 1, device=self.speed.device).clamp(min=0)
         speed = self.speed[:, platoons, index]
@@ -160,8 +160,8 @@ def measure_platoons(
 
     Args:
         model: the driving model. Its own equations take the steps, whatever simulator a job has.
-        agents: for each method what chooses the parameters, and a name for each of its networks;
-            all choose equally often.
+        agents: for each method what chooses the parameters, and a name for each of its networks.
+            Their windows are equally long.
         manoeuvre: what the leader does; None for the standard one.
 
     Returns:
@@ -193,7 +193,10 @@ def measure_platoons(
 
 
 def _grouped(model: DrivingModel, agents: Sequence[Agent]) -> list[list[Agent]]:
-    """Returns the agents in order, those behind one another together that drive the same model."""
+    """Returns neighbouring agents in groups that can be simulated as one batch.
+
+    An agent whose head puts another model around the driving model is alone in its group.
+    """
     groups: list[list[Agent]] = []
     for agent in agents:
         is_alone = agent.core.head.driven_model(model) is not model
@@ -218,8 +221,9 @@ def simulate_platoons(
         agents: what chooses the parameters; their windows and time steps are the same, and so is
             the model that each drives (`Agent.stepper`).
         manoeuvre: what the leader does.
-        generator: draws, on the CPU, what stochastic agents leave to chance; None: nothing is
-            drawn, as in `measure_platoons`, where noise would pass for instability.
+        generator: draws the noise of stochastic agents, on the CPU; None: there is no noise.
+            `measure_platoons` gives none, since noise that grows along the platoon could not be
+            told from instability.
 
     Returns:
         For each agent the speeds of its N platoons `(V + 1, N, T)`, vehicle 0 being the leader, and
@@ -238,8 +242,8 @@ def simulate_platoons(
     parameters: dict[str, Tensor] = {}
     for frame in range(road.speed.shape[-1] - 1):
         if frame % windows.stride == 0:
-            seen = [road.history(frame, windows.length, part) for part in parts]
-            chosen, states = _choose(agents, seen, states, generator)
+            histories = [road.history(frame, windows.length, part) for part in parts]
+            chosen, states = _choose(agents, histories, states, generator)
             parameters = agents[0].space.unpack(chosen)
         follower, _, _ = stepper.advance(follower, road.leader(frame), parameters)
         road.write(frame + 1, follower)
@@ -248,14 +252,14 @@ def simulate_platoons(
 
 def _choose(
     agents: Sequence[Agent],
-    seen: Sequence[History],
+    histories: Sequence[History],
     states: Sequence[AgentState],
     generator: torch.Generator | None,
 ) -> tuple[Tensor, list[AgentState]]:
     """Returns the parameters of all followers `(V N, n)` and each agent's state afterwards."""
     chosen = []
     after = []
-    for agent, history, state in zip(agents, seen, states, strict=True):
+    for agent, history, state in zip(agents, histories, states, strict=True):
         parameters, state_after = agent.act(history, state, generator)
         chosen.append(parameters.view(VEHICLES, len(agent.names), -1))
         after.append(state_after)
@@ -292,7 +296,7 @@ def _measures(
     drop = slowing(speed[..., after])
     first, last = drop[1], drop[-1]
     settled = ((speed[..., before] - cruise).abs() <= CALM).all(2).all(0)
-    # How vehicles find their places from the common start is not measured, except collisions.
+    # All but `settled` is measured from where the leader brakes on; collisions always count.
     collisions = (gap < 0).any(2).sum(0)
     apart = collisions == 0
     counted = torch.ones(speed.shape[-1] - braking, dtype=torch.bool, device=speed.device)
@@ -316,10 +320,9 @@ def _measures(
 
 
 def slowing(speed: Tensor) -> Tensor:
-    """Returns by how much each vehicle slows down.
+    """Returns by how much each vehicle slows down: its lowest speed below its highest before that.
 
-    That is from its highest speed so far to its lowest of all. An overshoot on the way back does
-    not count.
+    A higher speed after the lowest one is an overshoot while recovering, and does not count.
 
     Args:
         speed: `(*batch, T)`, m/s, from the frame on at which the leader begins to brake.

@@ -290,8 +290,8 @@ def joined(parts: Sequence[Lanes]) -> Lanes:
     before = 0
     for part in parts:
         for road in part.roads:
-            own = slice(road.vehicles.start + before, road.vehicles.stop + before)
-            roads.append(dataclasses.replace(road, vehicles=own))
+            vehicles = slice(road.vehicles.start + before, road.vehicles.stop + before)
+            roads.append(dataclasses.replace(road, vehicles=vehicles))
         ahead.append(part.ahead + before)
         before += len(part)
     columns = {}
@@ -362,7 +362,7 @@ def simulate_roads(
     stepper = stepper.for_model(composed.WithSpeedLimit(stepper.model))
     follower = stepper.begin(Start(lanes.position, lanes.speed, torch.zeros_like(lanes.speed)))
     ahead = lanes.leader(follower)
-    seen = deque([_seen(follower, ahead)] * windows.length, maxlen=windows.length)
+    observed = deque([_seen(follower, ahead)] * windows.length, maxlen=windows.length)
     positions, speeds = [follower.position], [follower.speed]
     min_gap = ahead.position - ahead.length - follower.position
     outside = torch.zeros_like(min_gap)
@@ -374,7 +374,7 @@ def simulate_roads(
     for _ in range(count):
         history = {}
         for number, name in enumerate(OBSERVED):
-            history[name] = torch.stack([frame[number] for frame in seen], -1)
+            history[name] = torch.stack([frame[number] for frame in observed], -1)
         chosen, state = agent.act(history, state, generator)
         outside += state.score > 1.0
         p = agent.space.unpack(chosen)
@@ -384,11 +384,11 @@ def simulate_roads(
                 ahead.position[None], ahead.speed[None], ahead.acceleration[None], ahead.length
             )
             moved, _, _ = stepper.advance(follower, now, p)
-            kept = lanes.speed + next(paces)
-            follower = _kept_steady(moved, follower, kept, lanes.steady, dt)
+            steady_speed = lanes.speed + next(paces)
+            follower = _kept_steady(moved, follower, steady_speed, lanes.steady, dt)
             ahead = lanes.leader(follower)
-            seen.append(_seen(follower, ahead))
-            min_gap = torch.minimum(min_gap, seen[-1][-1])
+            observed.append(_seen(follower, ahead))
+            min_gap = torch.minimum(min_gap, observed[-1][-1])
         positions.append(follower.position)
         speeds.append(follower.speed)
     return Driven(
@@ -407,11 +407,11 @@ def _seen(follower: Follower, ahead: Leader) -> tuple[Tensor, ...]:
 
 
 def _kept_steady(
-    moved: Follower, before: Follower, kept: Tensor, steady: Tensor, dt: float
+    moved: Follower, before: Follower, speed: Tensor, steady: Tensor, dt: float
 ) -> Follower:
     """Returns vehicles after a step, of which some drive at speeds `(D,)` that they keep."""
     return moved._replace(
-        position=torch.where(steady, before.position + kept * dt, moved.position),
-        speed=torch.where(steady, kept, moved.speed),
-        acceleration=torch.where(steady, (kept - before.speed) / dt, moved.acceleration),
+        position=torch.where(steady, before.position + speed * dt, moved.position),
+        speed=torch.where(steady, speed, moved.speed),
+        acceleration=torch.where(steady, (speed - before.speed) / dt, moved.acceleration),
     )

@@ -90,11 +90,11 @@ def _row(
         "pairs": len(about),
         "drivers": about["driver"].nunique(),
     }
-    own = {metric: table.loc[about.index] for metric, table in errors.items()}
-    judged = next(iter(own.values()))
+    of_site = {metric: table.loc[about.index] for metric, table in errors.items()}
+    judged = next(iter(of_site.values()))
     for method in METHODS:
         if method in judged:
-            for metric, table in own.items():
+            for metric, table in of_site.items():
                 row[f"{metric}_{method}"] = float(table[method].mean())
     for baseline in BASELINES:
         if baseline in judged and "policy" in judged:

@@ -198,11 +198,11 @@ def _whole_numbers(column: pd.Series) -> pd.Series:
 def _improvements(about: pd.DataFrame, values: pd.DataFrame, judge: str) -> dict[str, pd.Series]:
     """Returns each method's improvement of an error over each baseline, by column."""
     errors = values_of(values, judge, "test")
-    own = at_places(errors, about)
+    after = at_places(errors, about)
     columns = {}
     for baseline in about["method"].drop_duplicates():
         if baseline == "policy":
             continue
         before = about["pair_id"].map(errors[baseline])
-        columns[f"improvement_over_{baseline}"] = ((before - own) / before).where(before > 0)
+        columns[f"improvement_over_{baseline}"] = ((before - after) / before).where(before > 0)
     return dict(sorted(columns.items()))

@@ -235,8 +235,8 @@ def learned_range(training_data: TrainingData, augment: Augment | None = None) -
     by_network = []
     for number in range(len(training_data.names)):
         of_network = networks[rows] == number
-        seen = [version[of_network][counted[of_network]] for version in versions]
-        by_network.append(torch.cat(seen))
+        features = [version[of_network][counted[of_network]] for version in versions]
+        by_network.append(torch.cat(features))
     return ValidRange.of(by_network)
 
 

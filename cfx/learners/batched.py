@@ -285,10 +285,10 @@ def _dropped(layer: nn.Dropout, generator: torch.Generator, values: Tensor) -> T
     """Returns what `torch.nn.functional.dropout` does for the same numbers, bit by bit."""
     if not layer.training:
         return values
-    kept = torch.empty_like(values).bernoulli_(1.0 - layer.p, generator=generator)
+    mask = torch.empty_like(values).bernoulli_(1.0 - layer.p, generator=generator)
     if layer.p < 1:
-        kept.div_(1.0 - layer.p)
-    return values * kept
+        mask.div_(1.0 - layer.p)
+    return values * mask
 
 
 @contextlib.contextmanager

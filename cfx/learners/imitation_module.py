@@ -82,9 +82,9 @@ class ImitationDataset(NamedTuple):
         recorded = training_data.pairs.index.to(device)[pair]
         length = training_data.windows.length
         history = measured_history(training_data.recorded, recorded, first, length)
-        seen = tokens(history, policy_inputs(policy.inputs), policy.summary).float()
+        tokens_of_windows = tokens(history, policy_inputs(policy.inputs), policy.summary).float()
         unit = head.space.to_unit(labels.parameters).float()
-        tokens_of_pairs, mask = windows.to_grid(seen, pairs)
+        tokens_of_pairs, mask = windows.to_grid(tokens_of_windows, pairs)
         labels_of_pairs, _ = windows.to_grid(unit, pairs)
         sensitivity, _ = windows.to_grid(labels.sensitivity.float(), pairs)
         train = _training_windows(mask, validation)
@@ -124,16 +124,16 @@ def _training_windows(mask: Tensor, validation: float) -> Tensor:
         DataError: nothing is left of a pair.
     """
     counts = mask.sum(1)
-    kept = (counts * validation).round().long()
+    held_out = (counts * validation).round().long()
     if validation > 0:
-        kept = kept.clamp(min=1)
-    if bool((counts - kept < 1).any()):
+        held_out = held_out.clamp(min=1)
+    if bool((counts - held_out < 1).any()):
         raise DataError(
             f"a pair has only {int(counts.min())} training windows, too few to keep {validation:g}"
             " of them for validation; raise data.min_duration or set learner.validation=0"
         )
     number = torch.arange(mask.shape[1], device=mask.device)
-    return mask & (number < (counts - kept)[:, None])
+    return mask & (number < (counts - held_out)[:, None])
 
 
 def _sensitivity_weight(sensitivity: Tensor, train: Tensor) -> Tensor:

@@ -326,8 +326,8 @@ class WithResidual(Composed):
         jerk = self._remembered(follower, _JERK, p[JERK.name]) * torch.exp(-dt / p[JERK_TIME.name])
         held = self._remembered(follower, _HELD, follower.acceleration) + jerk * dt
         target = p[TARGET.name]
-        kept = torch.exp(-dt / p[RELAXATION_TIME.name])
-        residual = target + (follower.memory[..., _RESIDUAL] - target) * kept
+        share = torch.exp(-dt / p[RELAXATION_TIME.name])
+        residual = target + (follower.memory[..., _RESIDUAL] - target) * share
         passed = follower.memory[..., _PASSED] + dt
         inner = super().next_memory(follower, leader, p, dt, speed)
         own_memory = torch.stack([held, jerk, residual, passed], -1)

@@ -25,7 +25,7 @@ class LimitSettings(Settings):
         4.5,
         gt=0,
         le=50,
-        description="m/s2: hardest braking of a live vehicle that nothing endangers",
+        description="m/s2: hardest braking in live driving, unless a collision threatens",
     )
     emergency_deceleration: float = Field(
         9.0, gt=0, le=50, description="m/s2: hardest braking at all"
@@ -51,10 +51,11 @@ class LimitSettings(Settings):
 def limited_speed(
     limits: LimitSettings | None, speed: Tensor, acceleration: Tensor, proposed: Tensor, dt: float
 ) -> Tensor:
-    """Returns the speed that a vehicle can have one step later, nearest to the one wanted.
+    """Returns the speed one step later: the model's, as far as the limits allow it.
 
-    With a response time t_a the acceleration follows the wanted one as a first-order lag, exactly
-    integrated over a step: `a' = a + (1 - exp(-dt / t_a)) (a_wanted - a)`.
+    With a response time t_a the acceleration follows the model's with a first-order lag. Its
+    differential equation `da/dt = (a_model - a) / t_a` is solved exactly over the step, in which
+    a_model is constant: `a' = a + (1 - exp(-dt / t_a)) (a_model - a)`.
 
     Args:
         limits: of the vehicle; None: there are none.
@@ -69,6 +70,7 @@ def limited_speed(
     if limits is None:
         return proposed
     if limits.response_time is not None:
+        # The equation above times dt, plus v: v + dt a' = (v + dt a) + share (proposed - v - dt a).
         share = -math.expm1(-dt / limits.response_time)
         proposed = speed + dt * acceleration + share * (proposed - speed - dt * acceleration)
     slowest = (speed - limits.emergency_deceleration * dt).clamp(min=0.0)
@@ -77,7 +79,7 @@ def limited_speed(
 
 
 def at_limits(limits: LimitSettings | None, speed: Tensor, dt: float) -> Tensor:
-    """Says at which frames a vehicle is at a limit of acceleration.
+    """Says at which frames a vehicle accelerates or brakes as hard as its limits allow.
 
     Args:
         limits: of the vehicle; None: there are none.
@@ -85,7 +87,8 @@ def at_limits(limits: LimitSettings | None, speed: Tensor, dt: float) -> Tensor:
         dt: time step, s.
 
     Returns:
-        `(*batch, K + 1)` bool, for the acceleration on the way to each frame; frame 0 has none.
+        `(*batch, K + 1)` bool. Frame k is judged by the acceleration from frame k - 1 to k; frame 0
+        is False.
     """
     is_at_limit = torch.zeros_like(speed, dtype=torch.bool)
     if limits is None:

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -36,10 +36,6 @@ from cfx.policies.valid_range import RANGE_SIGNALS, ValidRange, situation_of, we
 from cfx.simulation.base import Stepper
 from cfx.simulation.windows import WindowSettings
 
-if TYPE_CHECKING:
-    pass
-
-
 _OF_DRIVERS = ("conditioning", "score", "beyond", "latent")
 
 
@@ -52,10 +48,12 @@ class AgentState(NamedTuple):
         state: of the networks, `(N, B, s)`.
         base: `(D, n)` in unit space; None where the head needs none.
         conditioning: what networks read of each driver in every window, `(D, c)`.
-        score: how far outside what was learned each was in the last window, `(D,)`; up to 1 is
-            inside. 0 where nothing is known of that.
-        beyond: which signals alone were unusual, too low and then too high, bool `(D, 2 f)`.
-        latent: what a stochastic head keeps of its random numbers, `(D, q)`; 0 before any.
+        score: how far the last window's situation was outside of those learned from, `(D,)`: up to
+            1 is inside. 0 if the policy has no `valid_range`.
+        beyond: which of f signals were, each by itself, outside of what was learned from, bool
+            `(D, 2 f)`: below it in the first f columns, above it in the others.
+        latent: what a stochastic head keeps from one window to the next, since its noise is
+            correlated in time, `(D, q)`; 0 at the start.
     """
 
     network: Tensor
@@ -78,11 +76,11 @@ class AgentState(NamedTuple):
         shape = (self.state.shape[0], int(place.max()) + 1, *self.state.shape[2:])
         state = self.state.new_zeros(shape)
         state[network, place] = self.state[network, self.place[drivers]]
-        kept = {name: getattr(self, name)[drivers] for name in _OF_DRIVERS}
+        of_drivers = {name: getattr(self, name)[drivers] for name in _OF_DRIVERS}
         base = self.base
         if base is not None:
             base = base[drivers]
-        return AgentState(network=network, place=place, state=state, base=base, **kept)
+        return AgentState(network=network, place=place, state=state, base=base, **of_drivers)
 
 
 @dataclass(frozen=True)
@@ -94,8 +92,8 @@ class TrainedOn:
         quantiles: 5, 50 and 95 % of speed (m/s), acceleration (m/s2) and time gap (s) of the
             drivers; empty if they are not known.
         expected_error: how large errors were on left-out drivers; None if that was not measured.
-        drivers: features of the drivers, of whom vehicles of a fleet draw theirs; None for a policy
-            that reads none.
+        drivers: driver features of those learned from. A simulated fleet draws its drivers from
+            them. None for a policy that reads no driver features.
     """
 
     pairs: Mapping[str, str] = field(default_factory=dict)
@@ -170,6 +168,7 @@ class Agent:
         base = self._unit_base(network, context)
         read_of_base = base
         if read_of_base is None:
+            # Zero columns: a head without a base has nothing of it among the networks' inputs.
             read_of_base = self.core.scaler.mean.new_zeros((len(network), 0)).double()
         features = self._known_features(network, context)
         state = self.core.network.initial_state(len(self.names), int(place.max()) + 1)
@@ -189,10 +188,10 @@ class Agent:
             present: which of them have this window; the others keep their state, bool `(D,)`.
         """
         grid = self._features(history, state)
-        seen = torch.zeros(grid.shape[:2], dtype=torch.bool, device=grid.device)
-        seen[state.network, state.place] = present
+        observes = torch.zeros(grid.shape[:2], dtype=torch.bool, device=grid.device)
+        observes[state.network, state.place] = present
         with torch.no_grad():
-            return state._replace(state=self.core.observe(grid, state.state, seen))
+            return state._replace(state=self.core.observe(grid, state.state, observes))
 
     @torch.no_grad()
     def act(
@@ -234,7 +233,7 @@ class Agent:
     def choose(
         self, history: History, state: AgentState, noise: Tensor | None = None
     ) -> tuple[Tensor, AgentState]:
-        """As `act`, as a pure function of tensors that no value branches: it can be exported.
+        """As `act`, without branches that depend on values, so that it can be exported (ONNX).
 
         Args:
             history: the last `windows.length` frames of D drivers, `(D, L)` each, SI units.
@@ -251,8 +250,9 @@ class Agent:
     def free_road_parameters(self, network: Tensor, base: Tensor | None) -> Tensor:
         """Returns the parameters of D drivers whom nobody is ahead of, `(D, n)`, SI units.
 
-        Networks have not learned to choose any. They are those to which answers fade outside what
-        was learned: the base or the pooled parameters; or else the model's defaults.
+        Networks learn from followers alone, so they are not asked. These are the parameters that
+        answers fade to outside the situations learned from: the base, else the pooled parameters,
+        else the model's defaults.
 
         Args:
             network: which network drives each, `(D,)`.
@@ -333,7 +333,7 @@ class Agent:
     def _apply(
         self, answer: Tensor, history: History, state: AgentState, noise: Tensor | None
     ) -> tuple[Tensor, AgentState]:
-        """Returns parameters `(D, n)`, SI units, that answers mean, and the state afterwards."""
+        """Turns the networks' answers into parameters `(D, n)`, SI units; returns the state too."""
         if self.valid_range is not None:
             situation = situation_of(history)
             score = self.valid_range.score(situation, state.network)
@@ -351,7 +351,7 @@ class Agent:
         return drawn, state._replace(latent=latent.to(state.latent))
 
     def _faded(self, answer: Tensor, state: AgentState) -> Tensor:
-        """Returns the parameters `(D, n)`, in unit space, of answers as far as they are used."""
+        """Returns parameters `(D, n)`, unit space: answers, faded in unusual situations."""
         unit = self.core.head.unit_parameters(answer, state.base)
         fallback = state.base
         if fallback is None:
@@ -398,8 +398,8 @@ class Agent:
                     f" which is not there; give a recording with a column {signal.column}, read by"
                     " data=tidy data.inputs=[...]"
                 )
-        seen = self.core.encode(history)
-        features = torch.cat([seen, state.conditioning.to(seen.dtype)], -1)
+        situation = self.core.encode(history)
+        features = torch.cat([situation, state.conditioning.to(situation.dtype)], -1)
         networks, drivers, _ = state.state.shape
         grid = self.core.scaler.mean.new_zeros((networks, drivers, features.shape[-1]))
         grid[state.network, state.place] = features.to(grid.dtype)

@@ -59,10 +59,10 @@ class Comparison:
             jobs: by name; several of one name, which differ in the seed alone, count as one: their
                 errors are averaged.
         """
-        every: list[Result] = []
+        objectives: list[tuple[MetricInfo, str]] = []
         for alike in jobs.values():
-            every += alike
-        objectives = [(job.judge, objective_of(job.judge, job.data)) for job in every]
+            for job in alike:
+                objectives.append((job.judge, objective_of(job.judge, job.data)))
         judge = common_judge(objectives)
         errors: dict[str, list[pd.DataFrame]] = {}
         for name, alike in jobs.items():
@@ -98,8 +98,8 @@ class Comparison:
                 "The jobs minimised different errors: they are ranked by the"
                 f" {self.judge.heading} on the test part."
             )
-        said = verdict(self.ranking)
-        return [*sentences, said] if said else sentences
+        judgement = verdict(self.ranking)
+        return [*sentences, judgement] if judgement else sentences
 
     def __repr__(self) -> str:
         """Returns the table and the verdict, for people."""

@@ -221,8 +221,11 @@ class JobConfig(JobNodes, JobResources, JobRecords):
         groups = ("model", "policy", "learner", "protocol", "data")
         if self.is_calibration:
             groups = ("model", "objective", "optimizer", "protocol", "data")
-        named = [f"{group} {getattr(self, group).get('name')}" for group in groups]
-        text = ", ".join(named)
+        components = []
+        for group in groups:
+            name = getattr(self, group).get("name")
+            components.append(f"{group} {name}")
+        text = ", ".join(components)
         return f"{text[:1].upper()}{text[1:]}"
 
     @classmethod

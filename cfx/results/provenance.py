@@ -99,8 +99,14 @@ def named_distributions(values: Mapping[str, Any]) -> dict[str, str]:
         if named == "all":
             entries += registry.entries(kind)
         elif not isinstance(named, str):
-            entries += [registry.entry(kind, name) for name in named if name != ALL_OWN]
-    return {entry.distribution: entry.version for entry in entries if entry.distribution != OWN}
+            for name in named:
+                if name != ALL_OWN:
+                    entries.append(registry.entry(kind, name))
+    versions = {}
+    for entry in entries:
+        if entry.distribution != OWN:
+            versions[entry.distribution] = entry.version
+    return versions
 
 
 def process_tags() -> dict[str, str]:

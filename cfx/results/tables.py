@@ -298,11 +298,12 @@ class KnownParameters:
         fits = evaluation.tables.get("fits")
         if fits is None or "noise_scale" not in fits:
             return None
-        tuned = tuple(
-            parameter for parameter in evaluation.parameters if f"median_{parameter.name}" in fits
-        )
+        tuned = []
+        for parameter in evaluation.parameters:
+            if f"median_{parameter.name}" in fits:
+                tuned.append(parameter)
         evidence = noise_evidence(evaluation.tables)
-        return cls(fits[fits["method"] == "driver_specific"], tuned, evidence)
+        return cls(fits[fits["method"] == "driver_specific"], tuple(tuned), evidence)
 
     @property
     def reliable(self) -> pd.Series:
@@ -351,17 +352,15 @@ class KnownParameters:
         table.add_column("determined for", justify="right")
         open_ones = []
         for parameter in self.parameters:
-            ends = (
-                float(self.rows[f"{end}_{parameter.name}"].median())
-                for end in ("median", "low", "high")
-            )
-            middle, low, high = ends
+            name = parameter.name
+            columns = [f"median_{name}", f"low_{name}", f"high_{name}"]
+            middle, low, high = self.rows[columns].median()
             unit = "" if parameter.unit == "1" else f" {parameter.unit}"
             interval = f"{middle:.3g}{unit} ({low:.3g} to {high:.3g})"
-            determined = self.determined(parameter.name)
-            table.add_row(parameter.name, interval, f"{determined} of {pairs}")
+            determined = self.determined(name)
+            table.add_row(name, interval, f"{determined} of {pairs}")
             if determined < self.reliable.sum():
-                open_ones.append(f"{parameter.name} for {self.reliable.sum() - determined}")
+                open_ones.append(f"{name} for {self.reliable.sum() - determined}")
         sentences = self._doubts()
         if open_ones:
             sentences.append(
@@ -384,13 +383,13 @@ class KnownParameters:
         sentences = []
         if "noise" in self.rows:
             name = str(self.rows["noise"].iloc[0])
-            said = f"Noise: {_NOISE[name]} (calibration.noise={name})"
+            sentence = f"Noise: {_NOISE[name]} (calibration.noise={name})"
             others = {kind: value for kind, value in self.evidence.items() if kind != name}
             if others:
                 second = max(others, key=others.__getitem__)
                 ahead = self.evidence[name] - others[second]
-                said += f", the most evident kind; {second} comes next, {ahead:.0f} nats behind"
-            sentences.append(f"{said}.")
+                sentence += f", the most evident kind; {second} comes next, {ahead:.0f} nats behind"
+            sentences.append(f"{sentence}.")
         pairs = len(self.rows)
         if "held" in self.rows and not self.checked:
             sentences.append(
@@ -398,18 +397,18 @@ class KnownParameters:
             )
         if self.checked:
             missed = int(are_contradicted(self.rows).sum())
-            said = (
+            sentence = (
                 f"Forecasts from these posteriors hold {self.rows['held'].mean():.0%} of the"
                 f" held-out parts ({INTERVAL_LEVEL:.0%} would be right)"
             )
             allowed = UNLIKELY * pairs + 2.0 * math.sqrt(UNLIKELY * (1.0 - UNLIKELY) * pairs)
             if missed > allowed:
-                said += (
+                sentence += (
                     f"; of {missed} of {pairs} pairs less than chance allows (held_chance below"
                     f" {UNLIKELY:g} in fits.parquet): doubt the intervals, the model or its noise"
                     " is not theirs"
                 )
-            sentences.append(f"{said}.")
+            sentences.append(f"{sentence}.")
         return sentences
 
     def _doubts(self) -> list[str]:
@@ -766,6 +765,6 @@ class Past(ResultTable):
 
 def _ratio(error: pd.Series, table: pd.DataFrame) -> float:
     """Returns the median ratio of an error in the past to that of driver-specific parameters."""
-    own = table["past_rmse_speed_driver_specific"]
-    ratio = (error / own.where(own > 0)).dropna()
+    baseline = table["past_rmse_speed_driver_specific"]
+    ratio = (error / baseline.where(baseline > 0)).dropna()
     return float(ratio.median()) if len(ratio) else math.nan

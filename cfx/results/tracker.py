@@ -1,4 +1,4 @@
-"""Where jobs are tracked: what a place that keeps runs must do; MLflow is one."""
+"""Tracking of jobs: what a service that keeps runs, such as MLflow, has to do."""
 
 from __future__ import annotations
 
@@ -26,7 +26,10 @@ MLFLOW = "mlflow"
 
 
 class Tracker:
-    """Tracks nothing: what a job uses if tracking is off; `tracked` gives the one that fits."""
+    """The run of a job, as the job writes to it; `tracked` opens the one that fits.
+
+    This base class is for jobs that are not tracked: it drops everything.
+    """
 
     run_id: str = ""
 
@@ -34,7 +37,12 @@ class Tracker:
         """Adds tags to the run."""
 
     def log_job(self, result: Result, description: str) -> None:
-        """Logs a job that is written; `description`, in Markdown, is for its page."""
+        """Logs the results of a job whose folder is complete.
+
+        Args:
+            result: the results.
+            description: of the job, in Markdown, for the page of its run.
+        """
 
     def how_to_open(self) -> tuple[str, ...]:
         """Returns lines that tell a user where to look."""
@@ -43,16 +51,17 @@ class Tracker:
 
 @dataclass(frozen=True)
 class Origin:
-    """What is known of a job besides its files: of a tracked one, from its run.
+    """Where a job comes from, and what is known of it besides its files.
 
     Attributes:
         place: what people know it by, such as "MLflow run 0a1b...".
-        folder: with its files; None: it did not finish.
-        reason: why it did not.
-        started: when.
-        seconds: how long it took, s; None: nobody knows.
+        folder: a folder with its files; None if it did not finish.
+        reason: why it did not finish.
+        started: when it started.
+        seconds: how long it took, s; None if that is not known.
         version: of cfx.
-        hydra: its own folder, where that still lies on this machine.
+        hydra: the folder that the job wrote, whose `.hydra` holds what was typed; None if it is no
+            longer on this machine.
     """
 
     place: str
@@ -139,7 +148,7 @@ def tracked(config: JobConfig, folder: Path) -> Iterator[Tracker]:
 
 
 def tracking_of_run(text: str) -> Tracking:
-    """Returns the first tracking of whose runs this could be the id; MLflow where it is none's."""
+    """Returns the first installed tracking whose ids of runs look like this; else MLflow."""
     installed = {name: tracking_named(name) for name in registry.names("tracker")}
     for tracking in installed.values():
         if tracking.is_run_id(text):

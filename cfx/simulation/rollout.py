@@ -314,15 +314,15 @@ def _check_bounds(
     """Raises ParameterError for a value outside the bounds, those of adaptation where wider."""
     if parameters is None:
         return
-    given: Mapping[str, Tensor | float]
+    by_name: Mapping[str, Tensor | float]
     if isinstance(parameters, Tensor):
         if parameters.shape[-1] != len(model.space):
             return  # what is wrong with the shape is said where it is read
         columns = model.space.unpack(parameters)
-        given = {name: columns[name] for name in model.space.names}
+        by_name = {name: columns[name] for name in model.space.names}
     else:
-        given = parameters
-    for name, value in given.items():
+        by_name = parameters
+    for name, value in by_name.items():
         calibrated, adapted = model.space[name], model.adaptation_space[name]
         low, high = min(calibrated.low, adapted.low), max(calibrated.high, adapted.high)
         values = torch.as_tensor(value)
@@ -349,12 +349,12 @@ def _windows(
     """
     space = model.space
     if not isinstance(parameters, Tensor):
-        given: dict[str, Tensor | float] = {}
+        values: dict[str, Tensor | float] = {}
         for parameter in space:
-            given[parameter.name] = parameter.default
-        given.update(parameters or {})
+            values[parameter.name] = parameter.default
+        values.update(parameters or {})
         named = {}
-        for name, value in given.items():
+        for name, value in values.items():
             parameter = space[name]  # raises where there is no such parameter
             named[parameter.name] = torch.as_tensor(value, dtype=speed.dtype, device=speed.device)
         return [(0, steps, named)]

@@ -94,17 +94,19 @@ class Split:
                 "split=1 leaves nothing to be tested; it is for a calibration of drivers' own"
                 " parameters alone (policy=fixed protocol=within_driver). Lower split"
             )
-        said = (
+        warning = (
             f"split={share:g} leaves {sum(tested):,} frames of {len(tested)} pairs to be tested,"
             f" {lasts:.2g} s of the median pair"
         )
         remedy = "lower split, or keep longer pairs (data.min_duration)"
         if middle <= settings.length:
-            raise DataError(f"{said}, no more than one window, in which nothing adapts; {remedy}")
+            raise DataError(
+                f"{warning}, no more than one window, in which nothing adapts; {remedy}"
+            )
         log.warning(
             "%s, all of it within the transient of the first %g s, in which every simulation is"
             " near the measured state: errors say little; %s",
-            said,
+            warning,
             TRANSIENT_S,
             remedy,
         )

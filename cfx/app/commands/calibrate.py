@@ -59,7 +59,7 @@ def overrides_of(words: Sequence[str]) -> list[str]:
         ConfigError: an override chooses a policy that is trained.
         DataError: a file cannot be read, or no dataset knows its layout.
     """
-    given: list[str] = []
+    typed: list[str] = []
     files: list[Path] = []
     keys = set()
     has_named_columns = False
@@ -74,7 +74,7 @@ def overrides_of(words: Sequence[str]) -> list[str]:
             )
         has_named_columns |= word.startswith(("data.columns", "data.units"))
         keys.add(key)
-        given.append(word)
+        typed.append(word)
     overrides = []
     for key, value in _CHOSEN.items():
         if key not in keys:
@@ -92,4 +92,4 @@ def overrides_of(words: Sequence[str]) -> list[str]:
         for file in files:
             paths.append(path_override("", file).removeprefix("="))
         overrides.append(f"data.path=[{','.join(paths)}]")
-    return [*overrides, *given]
+    return [*overrides, *typed]

@@ -27,7 +27,9 @@ class CiteCommand(Command):
         print(_item("software", "cfx", entry["title"], names, more))
         for article in entry["references"]:  # the method that cfx began from
             authors = article["authors"]
-            names = [f"{author['family-names']}, {author['given-names']}" for author in authors]
+            names = []
+            for author in authors:
+                names.append(f"{author['family-names']}, {author['given-names']}")
             key = f"{authors[0]['family-names'].lower()}{article['year']}"
             print(f"\n{_item('misc', key, article['title'], names, {'year': article['year']})}")
         return 0

@@ -93,14 +93,15 @@ def _flows(options: argparse.Namespace) -> None:
         if len(relation.speed):
             relations[kind or "unknown"] = relation.columns()
         mean = flow(relation.speed, relation.gap)
-        fastest, slowest = flow(relation.speed, relation.low), flow(relation.speed, relation.high)
+        # Of drivers at one speed, those with small gaps have the large flow.
+        high, low = flow(relation.speed, relation.low), flow(relation.speed, relation.high)
         for row, speed in enumerate(relation.speed):
             table.add_row(
                 kind or "unknown",
                 f"{speed:.1f}",
                 str(relation.drivers[row]),
                 f"{mean[row]:,.0f}",
-                f"{slowest[row]:,.0f} to {fastest[row]:,.0f}",
+                f"{low[row]:,.0f} to {high[row]:,.0f}",
             )
     if not relations:
         raise DataError(
@@ -115,12 +116,12 @@ def _flows(options: argparse.Namespace) -> None:
 
 
 def _quoted(path: str) -> str:
-    """Returns a path as Hydra's grammar has it."""
+    """Returns a path in quotes, within which Hydra takes commas and brackets as letters."""
     return "'" + path.replace("'", "\\'") + "'"
 
 
 def _name_alone(word: str) -> str:
-    """Returns a word of the command line, of a file its name without folders."""
+    """Returns a setting as it is, and a file's name without its folders, for a file to share."""
     return word if _is_setting(word) else Path(word).name
 
 
@@ -200,7 +201,7 @@ def _overrides_and_files(words: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def _words_to_use_it(overrides: Sequence[str]) -> str:
-    """Returns what a job that reads the file must be told besides its path, for a shell."""
+    """Returns the settings that a job needs besides the file's path, quoted for a shell."""
     words = ""
     for override in overrides:
         if not override.startswith("data="):

@@ -141,7 +141,9 @@ def methods_table(result: Result, scope: str = "test", *, with_improvement: bool
             "policy better by %,\nmean over drivers\n(95 % interval)", justify="right", no_wrap=True
         )
     for method in evaluation.methods:
-        values = [metrics.get(key_of(metric.name, method, scope)) for metric in shown]
+        values = []
+        for metric in shown:
+            values.append(metrics.get(key_of(metric.name, method, scope)))
         if all(value is None for value in values):
             continue
         cells = []

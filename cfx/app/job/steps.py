@@ -206,9 +206,9 @@ def make_protocol(config: JobConfig) -> Protocol:
     if isinstance(name, str):
         protocol = cast(type[Protocol], registry.get("protocol", name))
         for setting in protocol.jobs:
-            given = str(node.get(setting))
-            if is_run_id(given) or is_ready_made(given) or is_url(given):
-                node[setting] = folder_of(given, config.tracking.uri)
+            place = str(node.get(setting))
+            if is_run_id(place) or is_ready_made(place) or is_url(place):
+                node[setting] = folder_of(place, config.tracking.uri)
     return cast(Protocol, registry.create("protocol", node))
 
 

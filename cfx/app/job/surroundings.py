@@ -30,10 +30,10 @@ def with_signals_of_inputs(config: JobConfig) -> JobConfig:
         return config
     if "inputs" not in registry.get("dataset", dataset).schema.model_fields:
         return config
-    given = list(config.data.get("inputs") or ())
+    configured = list(config.data.get("inputs") or ())
     missing = []
     for name in chosen:
-        if name in given or name not in registry.names("input"):
+        if name in configured or name not in registry.names("input"):
             continue
         # cfx's own inputs read the signals of every recording; their code is heavy to import.
         is_own = registry.entry("input", name).distribution == OWN
@@ -41,7 +41,7 @@ def with_signals_of_inputs(config: JobConfig) -> JobConfig:
             missing.append(name)
     if not missing:
         return config
-    data = {**config.data, "inputs": [*given, *missing]}
+    data = {**config.data, "inputs": [*configured, *missing]}
     return JobConfig.of({**config.model_dump(), "data": data})
 
 
@@ -51,10 +51,10 @@ def require_signals(policy: Policy, pairs: PairSet) -> None:
     Raises:
         DataError: they lack one.
     """
-    given = set(pairs.surroundings)
+    recorded = set(pairs.surroundings)
     for name in policy.inputs:
         for signal in further_signals(declared_by(name)):
-            if signal not in given:
+            if signal not in recorded:
                 raise DataError(
                     f"{pairs.source}: the policy's input '{name}' reads the signal '{signal.name}',"
                     f" which these pairs do not have; read a recording with a column"

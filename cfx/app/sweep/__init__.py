@@ -88,8 +88,10 @@ class Sweep:
         copied = copy.deepcopy(config)  # what is resolved becomes read-only
         with contextlib.suppress(OmegaConfBaseException, ValueError), resolving(copied):
             tracking = OmegaConf.to_container(config.tracking, resolve=True)
-        given: Any = OmegaConf.to_container(config.hydra.overrides.hydra, resolve=False)
-        overrides = [override for override in given if not override.startswith("hydra.sweep.dir=")]
+        of_hydra: Any = OmegaConf.to_container(config.hydra.overrides.hydra, resolve=False)
+        overrides = [
+            override for override in of_hydra if not override.startswith("hydra.sweep.dir=")
+        ]
         escaped = str(folder).replace("'", "\\'")
         with read_write(config.hydra), open_dict(config.hydra):
             config.hydra.sweep.dir = str(folder)

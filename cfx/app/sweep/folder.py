@@ -327,10 +327,11 @@ def job_name(_root_: Any) -> str:
     It is the same for the same overrides in any order.
     """
     task: Any = OmegaConf.to_container(_root_.hydra.overrides.task, resolve=False)
-    given = {
-        override.partition("=")[0]: override for override in task
-    }  # of a key given twice the last one counts
-    return content_key([sorted(given.values()), *_sources(_root_)])[:8]
+    by_key = {}
+    for override in task:  # of a key given twice the last one counts
+        key, _, _ = override.partition("=")
+        by_key[key] = override
+    return content_key([sorted(by_key.values()), *_sources(_root_)])[:8]
 
 
 def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
@@ -392,8 +393,8 @@ def _state_of_data(node: Any) -> list[list[Any]] | None:
 def _sources(config: Any) -> tuple[Any, ...]:
     """Returns what else decides what the overrides mean: --config-name and --config-dir."""
     sources = config.hydra.runtime.config_sources
-    given = [str(source.path) for source in sources if source.provider == "command-line"]
-    return str(config.hydra.job.config_name), given
+    folders = [str(source.path) for source in sources if source.provider == "command-line"]
+    return str(config.hydra.job.config_name), folders
 
 
 OmegaConf.register_new_resolver("cfx_job", job_name, replace=True)

@@ -113,7 +113,9 @@ class SweepSummary:
     @cached_property
     def differing(self) -> list[str]:
         """The keys in which the jobs differ; all if they differ in none."""
-        keys = dict.fromkeys(key for job in self.jobs for key in job.overrides)
+        keys: dict[str, None] = {}  # as the jobs give them, each once
+        for job in self.jobs:
+            keys |= dict.fromkeys(job.overrides)
         differing = []
         for key in keys:
             if len({job.overrides.get(key) for job in self.jobs}) > 1:
@@ -216,8 +218,9 @@ class SweepSummary:
             shown["judged by"].append(short_label(row["method"]))
             shown[self.judge.title].append(_number(row[f"error_{self.judge.name}"]))
         for constant in _CONSTANT:
-            values = [_number(row[f"{self.judge.name}_{constant}"]) for row in self.rows]
-            shown[f"{self.judge.heading},\n{short_label(constant)}"] = values
+            column = f"{self.judge.name}_{constant}"
+            title = f"{self.judge.heading},\n{short_label(constant)}"
+            shown[title] = [_number(row[column]) for row in self.rows]
         for metric in self.metrics:
             if metric.headline:
                 shown[metric.title] = [_number(row[metric.name]) for row in self.rows]
@@ -241,17 +244,17 @@ class SweepSummary:
         geometric = row.get("improvement_geometric")
         if geometric is None:
             return ""
-        said = f"{100 * geometric:+.1f} %"
+        cell = f"{100 * geometric:+.1f} %"
         low, high = row.get("improvement_ci95_low"), row.get("improvement_ci95_high")
         if low is not None and high is not None:
-            said += f" ({100 * low:+.1f} to {100 * high:+.1f})"
+            cell += f" ({100 * low:+.1f} to {100 * high:+.1f})"
         baseline, comma, part = row["improvement_over"].partition(",")
-        said += f"\nover {short_label(baseline)}{comma}{part}"
+        cell += f"\nover {short_label(baseline)}{comma}{part}"
         estimates = {"geometric": geometric}
         for name in ("ratio_of_means", "drivers"):
             if row.get(f"improvement_{name}") is not None:
                 estimates[name] = row[f"improvement_{name}"]
-        return "\n".join([said, *doubts(estimates)])
+        return "\n".join([cell, *doubts(estimates)])
 
     def sentences(self) -> list[str]:
         """Returns how the jobs were compared, and which is closest to the drivers."""

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, cast
 from cfx.core import registry
 from cfx.core.component import Component
 from cfx.core.distributions import ALL_OWN, OWN
+from cfx.core.registry import Installed
 from cfx.errors import PluginError
 
 if TYPE_CHECKING:
@@ -222,34 +223,29 @@ _TAKEN = re.compile(
 """Names of other columns of `pairs.csv` and of other metrics of a job."""
 
 
-@dataclass(frozen=True)
-class MeasuredMetric:
-    """A metric that a job measures: its name, itself, and the distribution that brings it."""
+def info_of(
+    installed: Installed[Metric], measured: Collection[str], *, judges: bool = False
+) -> MetricInfo:
+    """Returns what tables, figures and reports need to know of a metric.
 
-    name: str
-    metric: Metric
-    distribution: str
-
-    def info(self, measured: Collection[str], *, judges: bool = False) -> MetricInfo:
-        """Returns what is to be known of it.
-
-        Args:
-            measured: the scopes that were.
-            judges: the job is judged by it: it is shown everywhere, of each scope.
-        """
-        metric = self.metric
-        scopes = SCOPES if judges else metric.scopes
-        return MetricInfo(
-            name=self.name,
-            unit=metric.unit,
-            direction=metric.direction,
-            summary=metric.summary,
-            heading=metric.heading,
-            meaning=metric.meaning,
-            scopes=tuple(scope for scope in scopes if scope in measured),
-            headline=metric.headline or judges,
-            distribution=self.distribution,
-        )
+    Args:
+        installed: the metric.
+        measured: the scopes in which it was measured.
+        judges: the job is judged by it: it is shown everywhere, of each scope.
+    """
+    metric = installed.component
+    scopes = SCOPES if judges else metric.scopes
+    return MetricInfo(
+        name=installed.name,
+        unit=metric.unit,
+        direction=metric.direction,
+        summary=metric.summary,
+        heading=metric.heading,
+        meaning=metric.meaning,
+        scopes=tuple(scope for scope in scopes if scope in measured),
+        headline=metric.headline or judges,
+        distribution=installed.distribution,
+    )
 
 
 @dataclass(frozen=True)
@@ -271,7 +267,7 @@ class MetricSet:
         judge: name of the error by which methods, and jobs, are compared.
     """
 
-    metrics: tuple[MeasuredMetric, ...]
+    metrics: tuple[Installed[Metric], ...]
     left_out: tuple[LeftOut, ...] = field(default=())
     judge: str = RMSE_SPEED.name
 
@@ -285,15 +281,15 @@ class MetricSet:
         Raises:
             PluginError: there is no metric of a name, or one that is named is broken.
         """
-        infos, left_out = [], []
+        metrics, left_out = [], []
         for entry in entries_of(chosen):
             try:
-                infos.append(made(entry))
+                metrics.append(made(entry))
             except PluginError as error:
                 if chosen != "all" or entry.distribution == OWN:
                     raise
                 left_out.append(leave_out(entry.name, entry.distribution, str(error)))
-        return cls(in_order(infos), tuple(left_out))
+        return cls(in_order(metrics), tuple(left_out))
 
     @classmethod
     def own(cls) -> MetricSet:
@@ -327,7 +323,7 @@ def leave_out(name: str, distribution: str, reason: str) -> LeftOut:
     return LeftOut(name, distribution, reason)
 
 
-def made(entry: registry.Entry) -> MeasuredMetric:
+def made(entry: registry.Entry) -> Installed[Metric]:
     """Makes the metric of an entry.
 
     Raises:
@@ -339,9 +335,9 @@ def made(entry: registry.Entry) -> MeasuredMetric:
             " a job's results; its author must rename it (small letters, digits and _)"
         )
     metric = cast(Metric, registry.create("metric", {"name": entry.name}))
-    return MeasuredMetric(entry.name, metric, entry.distribution)
+    return Installed("metric", entry.name, metric, entry.distribution)
 
 
-def in_order(metrics: Sequence[MeasuredMetric]) -> tuple[MeasuredMetric, ...]:
+def in_order(metrics: Sequence[Installed[Metric]]) -> tuple[Installed[Metric], ...]:
     """Returns metrics in the order in which they are shown."""
-    return tuple(sorted(metrics, key=lambda info: (info.metric.order, info.name)))
+    return tuple(sorted(metrics, key=lambda metric: (metric.component.order, metric.name)))

@@ -53,8 +53,10 @@ def trajectories(dtype: torch.dtype = torch.float64) -> Trajectories:
 def a_metric_gives_one_number_for_each_pair(metric: Metric) -> None:
     for dtype in (torch.float64, torch.float32):
         values = metric.compute(trajectories(dtype))
-        given = values.dtype if isinstance(values, Tensor) and values.is_floating_point() else dtype
-        expect_tensor(values, "compute", (PAIRS,), given, "a number for each pair, (pairs,)")
+        expected = (
+            values.dtype if isinstance(values, Tensor) and values.is_floating_point() else dtype
+        )
+        expect_tensor(values, "compute", (PAIRS,), expected, "a number for each pair, (pairs,)")
         assert not bool(values.isinf().any()), (
             "a number that is not defined is NaN, not infinite: it would make every mean infinite"
         )

@@ -10,10 +10,10 @@ from torch import Tensor
 from cfx.calibration.objectives import FrameValues, Objective
 from cfx.core import registry
 from cfx.core.distributions import OWN
+from cfx.core.registry import Installed
 from cfx.evaluation.metrics.base import (
     OBJECTIVE,
     SCOPES,
-    MeasuredMetric,
     Metric,
     MetricSet,
     Trajectories,
@@ -58,12 +58,12 @@ class ObjectiveMetric(Metric):
 def judged_by(chosen: MetricSet, objective: Objective) -> MetricSet:
     """Returns the metrics of a job with an objective, the error that it minimises first."""
     judge = objective.metric or OBJECTIVE
-    metrics = {one.name: one for one in chosen.metrics}
+    metrics = {metric.name: metric for metric in chosen.metrics}
     if objective.metric and judge not in metrics:
         metrics[judge] = made(registry.entry("metric", judge))
     elif not objective.metric:
         brought_by = OWN if registry.is_own(objective) else registry.origin(objective)
-        metric = ObjectiveMetric(registry.name_of(objective), objective)
-        metrics[judge] = MeasuredMetric(judge, metric, brought_by)
+        measured = ObjectiveMetric(registry.name_of(objective), objective)
+        metrics[judge] = Installed("metric", judge, measured, brought_by)
     first = metrics.pop(judge)
     return replace(chosen, metrics=(first, *in_order(list(metrics.values()))), judge=judge)

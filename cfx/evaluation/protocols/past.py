@@ -130,15 +130,15 @@ def past_errors(
         of_driver_specific = errors(
             context.agents.constant(FixedPolicy(), early), Followers(batch, each)
         )
-        own = of_driver_specific
+        of_start = of_driver_specific
         if residual:
             start = context.agents.constant(FixedPolicy(residual=True), early)
-            own = errors(start, Followers(batch, each))
-        frames = (first - cut).to(own)
+            of_start = errors(start, Followers(batch, each))
+        frames = (first - cut).to(of_start)
         products = (
-            own * own,
+            of_start * of_start,
             of_policy * of_policy,
-            own * of_policy,
+            of_start * of_policy,
             of_driver_specific * of_driver_specific,
         )
         for row, product in zip(errors_by_method, products, strict=True):
@@ -165,12 +165,12 @@ def expected_error(table: pd.DataFrame, fold: NDArray[np.int64]) -> ExpectedErro
 def expected_of_unseen(
     speed: pd.DataFrame, fold: NDArray[np.int64], expected: ExpectedError
 ) -> ExpectedError:
-    """Adds what bounds the errors of drivers of whom nothing is known.
+    """Returns expected errors completed by those of drivers without any history.
 
     Args:
         speed: RMSE of speed over full trajectories, m/s: a row per driver, a column per method.
         fold: in which fold each was tested, `(D,)`; each fold counts once.
-        found: what their pasts say.
+        expected: errors of drivers with history.
     """
     if not {"policy", "pooled"} <= set(speed):
         return expected

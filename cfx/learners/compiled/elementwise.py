@@ -167,12 +167,12 @@ def _source(program: Program, differentiated: Collection[int], block: int) -> st
     count = len(program.inputs)
     results, stored = [], []
     gradients: dict[str, list[str]] = {}
-    given: _Places = []
+    read: _Places = []  # the gradients of the outputs
     for k, (value, (number, column)) in enumerate(outputs):
         results.append(f"out{k}_[j] = {value};")
         stored.append((f"out{k}", (count + number, column)))
         gradients.setdefault(value, []).append(f"g{k}")
-        given.append((f"g{k}", (count + number, column)))
+        read.append((f"g{k}", (count + number, column)))
     forward = _function("forward", inputs, [*statements, *results], stored)
 
     names: list[str] = []
@@ -186,7 +186,7 @@ def _source(program: Program, differentiated: Collection[int], block: int) -> st
             results.append(f"to_{name}_[j] = {derivatives[name]};")
             stored.append((f"to_{name}", (first + place, column)))
     body = [*statements, *declarations, *results]
-    backward = _function("backward", [*inputs, *given], body, stored)
+    backward = _function("backward", [*inputs, *read], body, stored)
     lines = [head(torch.float32, block), _LOADS_AND_STORES, *forward, *backward]
     return "\n".join(lines) + "\n"
 

@@ -146,40 +146,42 @@ class CompiledWindow:
             self._cell, gates | given, list(gates), cell_key, together=network.hidden
         )
 
-    def _features(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
+    def _features(self, columns: Mapping[str, Tensor]) -> Sequence[Tensor]:
         """Returns normalised features."""
-        values = self.step.features(*self._surroundings(given), given["conditioning"])
-        return [(values - given["mean"]) / given["scale"]]
+        values = self.step.features(*self._surroundings(columns), columns["conditioning"])
+        return [(values - columns["mean"]) / columns["scale"]]
 
-    def _drive(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
+    def _drive(self, columns: Mapping[str, Tensor]) -> Sequence[Tensor]:
         """Returns motion and memory after a window, and speed and gap in it."""
         step = self.step
         if self.temperature is not None:
             # As an argument, not as the number that it is now: it falls from epoch to epoch.
             step = copy.copy(step)
-            step.model = step.model.at_temperature(given["temperature"][..., 0])
-        answer = (given["logits"] + given["bias"]).sigmoid()
-        after, speed, gap = step.steer(answer, *self._surroundings(given), given["base"])
+            step.model = step.model.at_temperature(columns["temperature"][..., 0])
+        answer = (columns["logits"] + columns["bias"]).sigmoid()
+        after, speed, gap = step.steer(answer, *self._surroundings(columns), columns["base"])
         moved = [after.position, after.speed, after.acceleration]
         if after.memory.shape[-1] > 0:
             moved.append(after.memory)
         return [*moved, speed, gap]
 
-    def _surroundings(self, given: Mapping[str, Tensor]) -> tuple[LoopState, LeaderWindow, Tensor]:
+    def _surroundings(
+        self, columns: Mapping[str, Tensor]
+    ) -> tuple[LoopState, LeaderWindow, Tensor]:
         """Returns where trajectories stand, and the leaders around a window with their lengths."""
-        empty = given["position"][..., :0]
-        motion = (given["position"], given["speed"], given["acceleration"])
-        now = LoopState(*motion, given.get("memory", empty), empty, empty)
-        position, speed, acceleration, *more = [given[name] for name in self.leader_names]
+        empty = columns["position"][..., :0]
+        motion = (columns["position"], columns["speed"], columns["acceleration"])
+        now = LoopState(*motion, columns.get("memory", empty), empty, empty)
+        position, speed, acceleration, *more = [columns[name] for name in self.leader_names]
         leader = LeaderWindow(position, speed, acceleration, tuple(more))
-        return now, leader, given["leader_length"][..., 0]
+        return now, leader, columns["leader_length"][..., 0]
 
-    def _cell(self, given: Mapping[str, Tensor]) -> Sequence[Tensor]:
+    def _cell(self, columns: Mapping[str, Tensor]) -> Sequence[Tensor]:
         """Returns what a layer carries after a window; as before where there is no such window."""
-        projected = given["projected"] + given["input_bias"]
-        recurrent = given["recurrent"] + given["hidden_bias"]
-        after = self.network.cell(projected, recurrent, given["carried"])
-        return [torch.where(given["present"] > 0, after, given["carried"])]
+        projected = columns["projected"] + columns["input_bias"]
+        recurrent = columns["recurrent"] + columns["hidden_bias"]
+        after = self.network.cell(projected, recurrent, columns["carried"])
+        return [torch.where(columns["present"] > 0, after, columns["carried"])]
 
 
 def _part(key: object, *names: object) -> object:

@@ -100,10 +100,10 @@ class RolloutBatch(NamedTuple):
         has_weight = self.weight > 0
         most = int(has_weight.sum(1).max())
         order = has_weight.long().argsort(dim=1, descending=True, stable=True)
-        kept = order[:, :most].sort(1).values
+        weighted = order[:, :most].sort(1).values
 
         def of_kept(values: Tensor) -> Tensor:
-            return values.gather(1, kept)
+            return values.gather(1, weighted)
 
         return self.each(of_kept)
 
@@ -235,39 +235,39 @@ class RolloutDataset:
         pooled = grid.mean(space.to_unit(start)).float()
         last = training_data.pairs.split.frame.to(device)[pair]
         validation = settings.validation
-        kept, few = _validation_drivers(
+        held_out, few = _validation_drivers(
             training_data, pair.cpu(), present.cpu(), validation, generator
         )
-        kept, few = kept.to(device), few.to(device)[:, None]
-        trains = present & (few | ~kept)
+        held_out, few = held_out.to(device), few.to(device)[:, None]
+        trains = present & (few | ~held_out)
         until = torch.where(few, (last * (1.0 - validation)).long(), last)
         bases = start
         if training_data.pairs.base is not None:
             bases = head.completed(training_data.pairs.base)
         base = space.to_unit(bases).float()
         frame = training_data.pairs.split.frame.to(device)[recorded]
-        seen = _measured_tokens(training_data, policy, batch, frame)
+        measured = _measured_tokens(training_data, policy, batch, frame)
         driver_features = _driver_features(training_data, policy, batch, frame)
         time_gap = usual_time_gaps(batch, frame, torch.arange(len(batch), device=device))
         of_driver = row[pair]
         # Whatever a member of the ensemble trains on counts, so that all members share one scaler.
         trained_by_any = trains.view(-1, ensemble_size, trains.shape[1]).any(1)
         first = slice(None, None, ensemble_size)
-        windows = torch.arange(seen.shape[1], device=device) * training_data.windows.stride
+        windows = torch.arange(measured.shape[1], device=device) * training_data.windows.stride
         counted = trained_by_any[..., None] & (windows <= until[first, :, None])
         placed = base[pair]
         in_queue = present & _at_sites(training_data, (QUEUES,))[pair]
         known_as = _known_as(training_data, pair, present, row, driver_features, time_gap, in_queue)
         scaler = _scaler(
-            seen, placed[first], driver_features, of_driver[first], known_as[first], counted
+            measured, placed[first], driver_features, of_driver[first], known_as[first], counted
         )
         return cls(
-            recordings=Recordings(batch, recorded, seen, driver_features, time_gap),
+            recordings=Recordings(batch, recorded, measured, driver_features, time_gap),
             pair=of_driver,
             known_as=known_as,
             in_queue=in_queue,
             trains=trains,
-            validates=present & (few | kept) & (validation > 0),
+            validates=present & (few | held_out) & (validation > 0),
             until=until,
             last=last,
             base=placed,
@@ -549,7 +549,7 @@ def _validation_drivers(
         keep any, bool `(N,)`.
     """
     drivers = training_data.pairs.known_drivers
-    kept, few = torch.zeros_like(present), torch.zeros(len(pair), dtype=torch.bool)
+    held_out, few = torch.zeros_like(present), torch.zeros(len(pair), dtype=torch.bool)
     for network in range(len(pair)):
         places = present[network].nonzero()[:, 0].tolist()
         driver_at = {}
@@ -563,8 +563,8 @@ def _validation_drivers(
         order = torch.randperm(len(names), generator=generator)[:count]
         chosen = {names[index] for index in order.tolist()}
         for place, driver in driver_at.items():
-            kept[network, place] = driver in chosen
-    return kept, few
+            held_out[network, place] = driver in chosen
+    return held_out, few
 
 
 def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
@@ -676,7 +676,7 @@ def _known_as(
 
 
 def _scaler(
-    seen: Tensor,
+    recorded_tokens: Tensor,
     base: Tensor,
     driver_features: Tensor,
     pair: Tensor,
@@ -686,14 +686,14 @@ def _scaler(
     """Measures the scaler of each ensemble, one after the other: their windows are many.
 
     Args:
-        seen: tokens, `(U, W, f)`.
+        recorded_tokens: tokens, `(U, W, f)`.
         base: of each place in unit space, `(E, B, n)`.
         driver_features: `(U, k)`, NaN where unknown.
         pair: which pair stands at each place, `(E, B)`.
         known_as: whose driver features each place's driver has, `(E, B)`.
         counted: windows that are trained on, bool `(E, B, W)`.
     """
-    windows = seen.shape[1]
+    windows = recorded_tokens.shape[1]
     # A driver of whom a feature is unknown does not count in any of them.
     measured = driver_features.isnan().logical_not().all(-1)
 
@@ -701,7 +701,10 @@ def _scaler(
         for shard in _shards_of_pairs(pair.shape[1]):
             pairs = pair[ensemble, shard]
             center = squashed(base[ensemble, shard])[:, None].expand(-1, windows, -1)
-            yield torch.cat([seen[pairs], center], -1)[None], counted[ensemble, shard][None]
+            yield (
+                torch.cat([recorded_tokens[pairs], center], -1)[None],
+                counted[ensemble, shard][None],
+            )
             memory.release()
 
     def features_of_drivers(ensemble: int) -> _Values:

@@ -218,8 +218,8 @@ class SteadySampler:
             number = (shares[:, 2] * upto[:, -1:]).long() + 1
             place = torch.searchsorted(upto, number)
             ratio = self.targets.ratio.gather(1, place).clamp(*RATIOS)
-            own = ratio * (target + VEHICLE_M) - VEHICLE_M
-            target = torch.where(cold_start, target, own)
+            of_driver = ratio * (target + VEHICLE_M) - VEHICLE_M
+            target = torch.where(cold_start, target, of_driver)
         return self._made(speed, time_gap, place, cold_start, target)
 
     def validation(self) -> SteadyTrajectories:

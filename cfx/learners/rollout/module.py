@@ -33,7 +33,7 @@ from cfx.learners.rollout.loss import Divisors, FrameWeights, TrajectoryLoss
 from cfx.learners.rollout.sampling import TrajectorySampler
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import TrainedShard, TrainingShard, untrained
-from cfx.learners.rollout.window import GradientPath, WindowStep
+from cfx.learners.rollout.window import GradientPath, Segment, WindowStep
 from cfx.policies.core import AgentCore
 from cfx.simulation.kernel.columns import Unsupported
 from cfx.simulation.rollout import can_compile
@@ -176,47 +176,43 @@ class RolloutModule(BatchedModule):
         expert, path = None, self.through_time
         if self.expert is not None and self.current_epoch < self.settings.distillation_epochs:
             expert, path = self.expert, replace(path, through_motion=False)
-        losses = self.trajectory_losses(
-            self.training_window, batch, self.settings.horizon, divisors, path, expert
-        )
-        for loss in losses:
+        segments = self.simulated(self.training_window, batch, self.settings.horizon, path, expert)
+        for segment in segments:
+            loss = self.trajectory_loss(segment, divisors)
             yield (loss * batch.weight).sum(1) / count
         if self.steady is not None and expert is None:
             yield self._steady_loss(step)
 
-    def trajectory_losses(
+    def simulated(
         self,
         step: WindowStep,
         batch: RolloutBatch,
         windows: int,
-        divisors: Divisors,
         path: GradientPath | None = None,
         expert: Expert | None = None,
-    ) -> Iterator[Tensor]:
-        """Simulates trajectories; yields the loss of each, `(N, D)`, of each segment.
+    ) -> Iterator[Segment]:
+        """Simulates trajectories, segment by segment, as `simulate` does.
 
-        With a head that draws, the loss of the centre's path is added to that of sampled ones. In
-        the first half of the epochs of training it is the only one: with noise from the start,
-        Krauss's model is not trained.
+        With a head that draws, `settings.paths` sampled paths of all trajectories stand behind the
+        path of the centre. In the first half of the epochs of training there are none: with noise
+        from the start, Krauss's model is not trained.
 
         Args:
             step: simulates one window.
             batch: the trajectories.
             windows: how many each lasts.
-            divisors: of their losses.
             path: the way that gradients take back; None: none, and all history is observed.
             expert: networks to imitate; None: none.
         """
-        sampled, noise = 0, None
+        noise = None
         if self.samples_paths and expert is None:
-            sampled = self.settings.paths
-            noise = self._noise(batch, windows, sampled)
-            of_centre = torch.zeros_like(noise[:, :, : noise.shape[2] // sampled])
+            noise = self._noise(batch, windows, self.settings.paths)
+            of_centre = torch.zeros_like(noise[:, :, : batch.place.shape[1]])
             noise = torch.cat([of_centre, noise], 2)
         burn_in_windows = None
         if path is not None:
             burn_in_windows = self.burn_in_windows
-        segments = simulate(
+        return simulate(
             step,
             self.dataset,
             batch,
@@ -227,13 +223,23 @@ class RolloutModule(BatchedModule):
             noise=noise,
             compiled=self.compiled.get(step),
         )
-        centre = slice(None, batch.place.shape[1])
-        for segment in segments:
-            loss = self.loss(segment.only(centre), divisors)
-            if sampled > 0:
-                others = segment.only(slice(centre.stop, None))
-                loss = loss + self.loss.of_paths(others, divisors, sampled)
-            yield loss
+
+    def trajectory_loss(self, segment: Segment, divisors: Divisors) -> Tensor:
+        """Returns the loss of each trajectory over a segment, `(N, D)`.
+
+        The loss of sampled paths, where the segment has any, is added to that of the centre's.
+
+        Args:
+            segment: `(N, (1 + paths) D, frames)`, as `simulated` gives it.
+            divisors: of the losses, `(N, D)` each.
+        """
+        count = divisors.objective.shape[1]
+        loss = self.loss(segment.only(slice(count)), divisors)
+        paths = segment.speed.shape[1] // count - 1
+        if paths > 0:
+            others = segment.only(slice(count, None))
+            loss = loss + self.loss.of_paths(others, divisors, paths)
+        return loss
 
     def _steady_loss(self, step: int | None) -> Tensor:
         """Returns the weighted error of the gaps at which drivers settle, `(N,)`.
@@ -428,8 +434,8 @@ class RolloutModule(BatchedModule):
     def _exact_loss(self, batch: RolloutBatch, windows: int, divisors: Divisors) -> Tensor:
         """Returns the weighted mean over trajectories, `(N,)`; NaN where nothing has weight."""
         self._noise_of = 0
-        losses = self.trajectory_losses(self.exact_step, batch, windows, divisors)
-        loss = torch.where(batch.weight > 0, next(losses), 0.0)
+        segment = next(self.simulated(self.exact_step, batch, windows))
+        loss = torch.where(batch.weight > 0, self.trajectory_loss(segment, divisors), 0.0)
         return loss.mul(batch.weight).sum(1) / batch.weight.sum(1)
 
     def _rate(self, step: int) -> float:

@@ -134,8 +134,8 @@ class StochasticHead(ResidualHead):
         names = self.space.names
         time = parameters[..., names.index(RELAXATION_TIME.name)]
         scale = parameters[..., names.index(NOISE_SCALE.name)]
-        kept = torch.exp(-window_s / time)
-        step = scale * torch.sqrt((1.0 + kept) / (1.0 - kept)) * noise
+        correlation = torch.exp(-window_s / time)
+        step = scale * torch.sqrt((1.0 + correlation) / (1.0 - correlation)) * noise
         target = names.index(TARGET.name)
         drawn = parameters[..., target] + step
         before, after = parameters[..., :target], parameters[..., target + 1 :]
@@ -146,9 +146,9 @@ class StochasticHead(ResidualHead):
     ) -> tuple[Tensor, Tensor]:
         """Draws the parameters that have a scale, from noise `(*batch, q)`."""
         time = self.space.names.index(PARAMETER_TIME.name)
-        kept = torch.exp(-window_s / parameters[..., time, None])
-        kept = torch.where(latent == 0, 0.0, kept)
-        latent = kept * latent + torch.sqrt(1.0 - kept.square()) * noise
+        correlation = torch.exp(-window_s / parameters[..., time, None])
+        correlation = torch.where(latent == 0, 0.0, correlation)
+        latent = correlation * latent + torch.sqrt(1.0 - correlation.square()) * noise
         scale = parameters[..., -self.latent_width :]
         low, high = self._low.to(parameters), self._high.to(parameters)
         centre = parameters[..., self._drawn]

@@ -180,9 +180,9 @@ def _series(
 ) -> ImprovementSeries:
     defined = np.flatnonzero(np.isfinite(values))
     order = defined[np.argsort(-values[defined], kind="stable")]
-    kept = values[order]
+    ordered = values[order]
     ids = tuple(str(pair_ids[index]) for index in order)
-    return ImprovementSeries(name, ids, kept, np.maximum(kept, low), kept < low)
+    return ImprovementSeries(name, ids, ordered, np.maximum(ordered, low), ordered < low)
 
 
 _NAMED = 40

@@ -42,8 +42,8 @@ def loss_quartiles(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
         losses = curves.over_networks(table, column)
         if not losses.empty:
             count = min(_MOST_POINTS, len(losses))
-            kept = np.unique(np.linspace(0, len(losses) - 1, count).round().astype(int))
-            quartiles[column] = losses.iloc[kept].quantile((0.25, 0.5, 0.75), axis=1).T
+            drawn = np.unique(np.linspace(0, len(losses) - 1, count).round().astype(int))
+            quartiles[column] = losses.iloc[drawn].quantile((0.25, 0.5, 0.75), axis=1).T
     return quartiles
 
 
@@ -93,8 +93,10 @@ def draw_learning(table: pd.DataFrame) -> Figure:
     if sampled_from is not None:
         dash = (0, (4, 2))
         axes.axvline(sampled_from, color=colours.EDGE, linewidth=0.9, linestyle=dash, label=SAMPLED)
-    ends = [one[[0.25, 0.75]].to_numpy(dtype=float).ravel() for one in losses.values()]
-    ticks = _logarithmic_ticks(np.concatenate([np.empty(0), *ends]))
+    drawn = [np.empty(0)]
+    for quartiles in losses.values():
+        drawn.append(quartiles[[0.25, 0.75]].to_numpy(dtype=float).ravel())
+    ticks = _logarithmic_ticks(np.concatenate(drawn))
     if ticks:
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(FixedLocator(ticks))

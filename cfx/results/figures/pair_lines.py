@@ -152,8 +152,8 @@ def _signal_panel(
 
 def _range(lines: Sequence[canvas.Line]) -> tuple[float | None, float | None]:
     """Returns the lowest and the highest value of the lines that are not hidden; None for none."""
-    seen = [line.values for line in lines if not line.hidden]
-    values = canvas.finite(np.concatenate([np.empty(0), *seen]))
+    visible = [line.values for line in lines if not line.hidden]
+    values = canvas.finite(np.concatenate([np.empty(0), *visible]))
     if not len(values):
         return None, None
     return float(values.min()), float(values.max())
@@ -171,13 +171,13 @@ def _collisions(lines: Sequence[canvas.Line]) -> tuple[tuple[str, float, float],
 
 def _parameter_panel(parameter: ParameterAxis, lines: tuple[canvas.Line, ...]) -> Panel:
     """Chooses an axis of at least a fifth of the range: a small change looks small."""
-    title, said = wording.unit_label(parameter.name, parameter.unit), parameter.meaning
+    title, meaning = wording.unit_label(parameter.name, parameter.unit), parameter.meaning
     lowest, highest = _range(lines)
     if parameter.low is None or parameter.high is None:
         if lowest is None or highest is None:
-            return Panel(title, lines, None, None, meaning=said)
+            return Panel(title, lines, None, None, meaning=meaning)
         margin = 0.15 * max(highest - lowest, 1e-3 * abs(highest), 1e-6)
-        return Panel(title, lines, lowest - margin, highest + margin, meaning=said)
+        return Panel(title, lines, lowest - margin, highest + margin, meaning=meaning)
     bounds = (parameter.low, parameter.high)
     if lowest is None or highest is None:
         lowest, highest = bounds
@@ -185,7 +185,7 @@ def _parameter_panel(parameter: ParameterAxis, lines: tuple[canvas.Line, ...]) -
     centre, margin = (highest + lowest) / 2, 0.06 * width
     low = max(centre - width / 2, min(bounds[0], lowest)) - margin
     high = min(centre + width / 2, max(bounds[1], highest)) + margin
-    return Panel(title, lines, low, high, bounds=bounds, meaning=said)
+    return Panel(title, lines, low, high, bounds=bounds, meaning=meaning)
 
 
 _LINE = 150
@@ -527,10 +527,13 @@ def chosen_pairs(
         values = gains.to_numpy(dtype=float)
         if is_calibration:
             values = -rows[result.judge.name].to_numpy(dtype=float)
-        ranked = rank_pairs(list(gains.index), values, count)
-        if is_calibration:
-            ranked = tuple(RankedPair(pair.pair_id, pair.rank, math.nan) for pair in ranked)
-        return [(pair, by_id[pair.pair_id]) for pair in ranked]
+        best_and_worst = []
+        for pair in rank_pairs(list(gains.index), values, count):
+            # A calibration alone has nothing to be better than.
+            improvement = math.nan if is_calibration else pair.improvement
+            ranked = RankedPair(pair.pair_id, pair.rank, improvement)
+            best_and_worst.append((ranked, by_id[pair.pair_id]))
+        return best_and_worst
     wanted = [pair_id] if isinstance(pair_id, str) else list(pair_id)
     chosen = []
     for name in wanted:
@@ -544,8 +547,12 @@ def chosen_pairs(
 def _errors(result: Result, pair_id: str, signal: str) -> dict[str, float]:
     """Returns the RMSE of a signal of one pair by method, in the methods' order."""
     rows = result.pairs[result.pairs["pair_id"] == pair_id].drop_duplicates("method")
-    errors = rows.set_index("method")[f"rmse_{signal}"]
-    return {method: float(errors[method]) for method in result.shown_methods if method in errors}
+    by_method = rows.set_index("method")[f"rmse_{signal}"]
+    errors = {}
+    for method in result.shown_methods:
+        if method in by_method:
+            errors[method] = float(by_method[method])
+    return errors
 
 
 def _errors_text(result: Result, pair_id: str, signal: str, unit: str) -> str:

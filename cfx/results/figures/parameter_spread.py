@@ -139,24 +139,24 @@ def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
     for row, spread in zip(rows, spreads, strict=True):
         axes.vlines((0, 1), row - 0.42, row + 0.42, color=colours.EDGE, linewidth=1)
         places = spread.places(spread.values)
-        named = {
-            method: wording.method_label(method) if row == 0 else ""
-            for method in ("driver_specific", "default")
-        }
+        labels = dict.fromkeys(("driver_specific", "default", "pooled"), "")
+        if row == 0:  # the legend names each method once
+            for method in labels:
+                labels[method] = wording.method_label(method)
         aside = row + _WIDTH * spread_offsets(len(places))
         dots: dict[str, Any] = {
             "alpha": 0.55,
             "markeredgewidth": 0,
-            "label": named["driver_specific"],
+            "label": labels["driver_specific"],
         }
         canvas.draw_points(
             axes, places, aside, "o", colours.colour_of("driver_specific"), 3.2, **dots
         )
         pooled = spread.places(spread.pooled)
-        said = wording.method_label("pooled") if row == 0 and len(pooled) else ""
+        label = labels["pooled"] if len(pooled) else ""
         rows_of_it = np.full(len(pooled), row)
         canvas.draw_points(
-            axes, pooled, rows_of_it, "D", colours.colour_of("pooled"), 6, label=said
+            axes, pooled, rows_of_it, "D", colours.colour_of("pooled"), 6, label=label
         )
         default, bar = spread.places(np.array([spread.default])), {"markeredgewidth": 2.2}
         canvas.draw_points(
@@ -166,11 +166,13 @@ def _values(axes: Axes, spreads: Sequence[ParameterSpread]) -> None:
             "|",
             colours.colour_of("default"),
             17,
-            label=named["default"],
+            label=labels["default"],
             **bar,
         )
         _ends(axes, spread, row)
-    names = [wording.unit_label(spread.axis.name, spread.axis.unit) for spread in spreads]
+    names = []
+    for spread in spreads:
+        names.append(wording.unit_label(spread.axis.name, spread.axis.unit))
     axes.set_yticks(rows, names)
     axes.set_ylim(len(spreads) - 0.4, -0.6)
     axes.set_xlim(-0.16, 1.16)

@@ -281,8 +281,8 @@ def _best(runs: Sequence[Any], error: str) -> str:
     values = _errors(runs, error)
     if not values:
         return f", {runs[0].info.status}"
-    said = f", smallest {error} {_mean_error(runs, error):.3f}"
-    return f"{said} (mean of {len(values)} seeds)" if len(values) > 1 else said
+    smallest = f", smallest {error} {_mean_error(runs, error):.3f}"
+    return f"{smallest} (mean of {len(values)} seeds)" if len(values) > 1 else smallest
 
 
 def _experiment_lines(client: MlflowClient, names: dict[str, str], address: str) -> list[str]:

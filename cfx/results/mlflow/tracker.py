@@ -254,10 +254,10 @@ class MlflowTracker(Tracker):
         points = []
         for column in ("train_loss", "validation_loss") if len(curves) else ():
             means = over_networks(curves, column).mean(axis=1)
-            kept = np.unique(
+            logged = np.unique(
                 np.linspace(0, len(means) - 1, min(CURVE_POINTS, len(means))).round().astype(int)
             )
-            for k in kept:
+            for k in logged:
                 points.append((column, float(means.iloc[k]), int(means.index[k])))
         self._log_metrics(points)
 
@@ -466,11 +466,11 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
     # MLflow would refuse a whole number where a signature says a float, and a number where it says
     # a text; the table's own checks convert both.
     anything = AnyType()  # type: ignore[no-untyped-call]  # MLflow's
-    taken: list[Any] = [ColSpec(anything, str(name)) for name in frame]
-    given: list[Any] = [ColSpec("string", "pair_id")]
+    inputs: list[Any] = [ColSpec(anything, str(name)) for name in frame]
+    outputs: list[Any] = [ColSpec("string", "pair_id")]
     for name in answer.columns[1:]:
-        given.append(ColSpec("double", str(name)))
-    signature = ModelSignature(Schema(taken), Schema(given))
+        outputs.append(ColSpec("double", str(name)))
+    signature = ModelSignature(Schema(inputs), Schema(outputs))
     return {"signature": signature, "input_example": frame}
 
 
@@ -534,13 +534,12 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
 
     client = store.client
     same = f"tags.`cfx.app.job` = '{tags['cfx.app.job']}' and attributes.status != 'FINISHED'"
-    left = [
-        run
-        for run in client.search_runs([store.experiment_id], same, max_results=10)
-        if not _is_running(run)
-    ]
-    if left:
-        run, logged = left[0], left[0].data.params
+    unfinished = []
+    for run in client.search_runs([store.experiment_id], same, max_results=10):
+        if not _is_running(run):
+            unfinished.append(run)
+    if unfinished:
+        run, logged = unfinished[0], unfinished[0].data.params
         client.update_run(run.info.run_id, status="RUNNING", name=name)
         if "cfx.failure" in run.data.tags:
             client.delete_tag(run.info.run_id, "cfx.failure")
@@ -585,12 +584,12 @@ def _remove_repeated(store: Store, run_id: str) -> None:
 
     There is one if a job was killed after its run was closed, and before its folder said so.
     """
-    own = store.client.get_run(run_id)
+    this_run = store.client.get_run(run_id)
     same = f"tags.`cfx.replaced_by` = '{run_id}' and attributes.status = 'FINISHED'"
     for run in store.client.search_runs([store.experiment_id], same):
-        if run.data.tags.get("cfx.app.job") != own.data.tags.get("cfx.app.job"):
+        if run.data.tags.get("cfx.app.job") != this_run.data.tags.get("cfx.app.job"):
             continue
-        if _written(run.data.metrics) == _written(own.data.metrics):
+        if _written(run.data.metrics) == _written(this_run.data.metrics):
             store.client.delete_run(run.info.run_id)
 
 

@@ -153,9 +153,9 @@ def cache_folder() -> Path:
     """Returns a folder that this user alone can write to."""
     base = os.environ.get("XDG_CACHE_HOME") or "~/.cache"
     folder = Path(base) / "cfx" / "kernels"
-    given = os.environ.get("CFX_KERNEL_CACHE")
-    if given:
-        folder = Path(given)
+    chosen = os.environ.get("CFX_KERNEL_CACHE")
+    if chosen:
+        folder = Path(chosen)
     folder = folder.expanduser()
     try:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -200,7 +200,7 @@ def separate_cache() -> None:
     """Names a folder for this kind of processor as PyTorch's cache; again changes nothing."""
     sets = f"{processor()}\0{torch.backends.cpu.get_cpu_capability()}"
     name = f"cpu-{hashlib.sha256(sets.encode()).hexdigest()[:16]}"
-    given = os.environ.get(_VARIABLE)
-    base = Path(given) if given else cache_folder() / "torch"
+    chosen = os.environ.get(_VARIABLE)
+    base = Path(chosen) if chosen else cache_folder() / "torch"
     if base.name != name:
         os.environ[_VARIABLE] = str(base / name)

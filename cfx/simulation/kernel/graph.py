@@ -373,7 +373,7 @@ def _number(value: Any) -> str:
     return ""
 
 
-def _converted(node: fx.Node, given: str) -> str:
+def _converted(node: fx.Node, value: str) -> str:
     """Returns a value in another type, of which a kernel has two: numbers and conditions.
 
     Whole numbers are kept as floating-point numbers; indices of a memory are small.
@@ -381,11 +381,11 @@ def _converted(node: fx.Node, given: str) -> str:
     source: Any = node.args[0]
     before, after = source.meta["val"].dtype, node.meta["val"].dtype
     if before == after or (before in _WHOLE and after != torch.bool):
-        return given
+        return value
     if before == torch.bool and after.is_floating_point:
-        return f"({given} ? real(1) : real(0))"
+        return f"({value} ? real(1) : real(0))"
     if before.is_floating_point and after in _WHOLE:
-        return f"(std::trunc({given}))"
+        return f"(std::trunc({value}))"
     raise Unsupported(f"a conversion from {before} to {after}")
 
 
@@ -416,7 +416,7 @@ def _huber(node: fx.Node, arguments: list[str]) -> str:
     return f"(huber({arguments[0]} - {arguments[1]}, {delta}))"
 
 
-def power(base: str, exponent: float, given: str) -> str:
+def power(base: str, exponent: float, exponent_text: str) -> str:
     """Returns a power with a constant exponent, computed as PyTorch does."""
     simple = {
         0.5: f"(std::sqrt({base}))",
@@ -428,4 +428,4 @@ def power(base: str, exponent: float, given: str) -> str:
         -1.0: f"(real(1) / {base})",
         -2.0: f"(real(1) / ({base} * {base}))",
     }
-    return simple.get(exponent, f"(std::pow({base}, {given}))")
+    return simple.get(exponent, f"(std::pow({base}, {exponent_text}))")

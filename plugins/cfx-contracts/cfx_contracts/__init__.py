@@ -81,8 +81,8 @@ def contract_for(kind: str) -> Contract:
             f" Known: {', '.join(registry.KINDS)}."
         )
     plural = registry.KINDS[kind].entry_points.removeprefix("cfx.")
-    found: Contract = import_module(f"cfx_contracts.{plural}").CONTRACT
-    return found
+    contract: Contract = import_module(f"cfx_contracts.{plural}").CONTRACT
+    return contract
 
 
 def check_contract(component: Any, **further: Any) -> None:

@@ -80,15 +80,15 @@ def check(kind: str | None = None, name: str | None = None) -> int:
                 verdicts.append(examine(entry))
             task.advance()
     rows = blank_table("kind", "name", "distribution", "version", "from", "state")
-    for one in verdicts:
-        entry = one.entry
+    for verdict in verdicts:
+        entry = verdict.entry
         rows.add_row(
-            entry.kind, entry.name, entry.distribution, entry.version, entry.location, one.state
+            entry.kind, entry.name, entry.distribution, entry.version, entry.location, verdict.state
         )
     print_table(rows)
-    for hint in dict.fromkeys(one.hint for one in verdicts if one.hint):
+    for hint in dict.fromkeys(verdict.hint for verdict in verdicts if verdict.hint):
         print(f"Hint: {hint}")
-    complaints = dict.fromkeys(one.complaint for one in verdicts if one.complaint)
+    complaints = dict.fromkeys(verdict.complaint for verdict in verdicts if verdict.complaint)
     for complaint in complaints:
         print(complaint, file=sys.stderr)
     return 1 if complaints else 0
@@ -107,15 +107,15 @@ def _unheard() -> Iterator[None]:
 
 def _chosen(kind: str | None, name: str | None) -> list[registry.Entry]:
     """Returns the entries of all kinds or one, of all names or one."""
-    found = []
+    entries = []
     kinds = list(registry.every_kind()) if kind is None else [registry.kind_of(kind).name]
-    for one in kinds:
-        for entry in registry.entries(one):
+    for each in kinds:
+        for entry in registry.entries(each):
             if name is None or entry.name == name:
-                found.append(entry)
-    if not found and kind is not None and name is not None:
+                entries.append(entry)
+    if not entries and kind is not None and name is not None:
         registry.entry(kind, name)  # says which names there are
-    return found
+    return entries
 
 
 def examine(entry: registry.Entry) -> Verdict:
@@ -182,7 +182,7 @@ def _shadow(entry: registry.Entry) -> str:
             f"{entry} is never used, because cfx has a {entry.kind} '{entry.name}' of its own;"
             f" its author must rename it, or pip uninstall {entry.distribution}"
         )
-    others = " and ".join(f"{one.distribution} {one.version}" for one in rivals)
+    others = " and ".join(f"{rival.distribution} {rival.version}" for rival in rivals)
     return (
         f"{entry} cannot be used, because {others} brings a {entry.kind} of that name too;"
         " uninstall one of them"
@@ -191,11 +191,11 @@ def _shadow(entry: registry.Entry) -> str:
 
 def _broken_contract(entry: registry.Entry, component: object) -> str:
     """Returns the first statement of the contract that does not hold; "" if all hold."""
-    found = list(violations(component, contract_for(entry.kind).quick))
-    if not found:
+    broken = list(violations(component, contract_for(entry.kind).quick))
+    if not broken:
         return ""
-    check, sentence = found[0]
+    check, sentence = broken[0]
     text = f"{entry} breaks its contract: {' '.join(sentence.split())} ({check})"
-    if len(found) > 1:
-        text += f"; and {len(found) - 1} more"
+    if len(broken) > 1:
+        text += f"; and {len(broken) - 1} more"
     return f"{text}; cfx_contracts.check_contract in its own tests shows all of it"

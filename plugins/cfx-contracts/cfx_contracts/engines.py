@@ -44,11 +44,11 @@ def _nothing(_units: int) -> None:
 def every_shard_has_its_own_result(engine: Engine) -> None:
     expected = {}
     for number, shard in enumerate(_shards()):
-        expected[number] = [one * one for one in shard]
+        expected[number] = [value * value for value in shard]
     for shares_cores in (True, False):
         with closing(engine):
-            found = dict(engine.map(_squares, _shards(), _nothing, shares_cores=shares_cores))
-        assert found == expected, (
+            results = dict(engine.map(_squares, _shards(), _nothing, shares_cores=shares_cores))
+        assert results == expected, (
             "map yields the number of each shard, as it was given, with its result, once each"
         )
 
@@ -65,8 +65,8 @@ def progress_adds_up(engine: Engine) -> None:
 
 def no_shards_are_no_work(engine: Engine) -> None:
     with closing(engine):
-        found = list(engine.map(_squares, [], _nothing))
-    assert found == [], "without a shard there is no result"
+        results = list(engine.map(_squares, [], _nothing))
+    assert results == [], "without a shard there is no result"
 
 
 def what_the_work_raises_is_raised_again(engine: Engine) -> None:
@@ -100,9 +100,9 @@ def whoever_stops_listening_cancels_the_rest(engine: Engine) -> None:
 
 def it_can_be_used_again_after_close(engine: Engine) -> None:
     for _ in range(2):
-        found = dict(engine.map(_squares, [[2]], _nothing))
+        results = dict(engine.map(_squares, [[2]], _nothing))
         engine.close()
-        assert found == {0: [4]}, "close lets go of workers; map makes them again"
+        assert results == {0: [4]}, "close lets go of workers; map makes them again"
 
 
 CONTRACT = contract_of(__name__, "engine")

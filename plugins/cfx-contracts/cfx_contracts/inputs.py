@@ -35,7 +35,10 @@ def history(input: PolicyInput, dtype: torch.dtype = torch.float64) -> History:
     """Returns made-up frames of every signal that an input reads, `(B, L)` each."""
     generator = torch.Generator().manual_seed(7)
     frames = {}
-    for signal in {**SIGNALS, **{one.name: one for one in input.further_signals()}}.values():
+    signals = dict(SIGNALS)
+    for further in input.further_signals():
+        signals[further.name] = further
+    for signal in signals.values():
         low, high = _range(signal)
         share = torch.rand((DRIVERS, FRAMES), generator=generator, dtype=torch.float64)
         frames[signal.name] = (low + (high - low) * share).to(dtype)

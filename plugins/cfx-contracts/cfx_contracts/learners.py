@@ -160,25 +160,25 @@ def learns_something(learner: Learner) -> None:
 
 def the_same_seed_gives_the_same_networks(learner: Learner) -> None:
     data = training_data(needs_labels=learner.needs_labels)
-    one = _state(_fitted(learner, data))
+    first = _state(_fitted(learner, data))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(20_027)
         state = torch.get_rng_state()
-        two = _state(learner.fit(_POLICY, data))
+        second = _state(learner.fit(_POLICY, data))
         assert torch.equal(torch.get_rng_state(), state), (
             "the global random state must not be drawn from: other threads of the program do; draw"
             " from a torch.Generator (cfx.learners.batched.fit gives dropout one)"
         )
-    assert _equal(one, two), (
+    assert _equal(first, second), (
         "the same training data twice gave two results: randomness must come from `seed` of the"
         " training data alone"
     )
 
 
 def another_seed_gives_other_networks(learner: Learner) -> None:
-    one = _fitted(learner, training_data(needs_labels=learner.needs_labels, seed=0))
-    two = _fitted(learner, training_data(needs_labels=learner.needs_labels, seed=1))
-    assert not _equal(_state(one), _state(two)), (
+    first = _fitted(learner, training_data(needs_labels=learner.needs_labels, seed=0))
+    second = _fitted(learner, training_data(needs_labels=learner.needs_labels, seed=1))
+    assert not _equal(_state(first), _state(second)), (
         "seeds 0 and 1 gave the same networks: `seed` of the training data must reach the initial"
         " weights, or repeating an experiment with other seeds shows less variation than there is"
     )
@@ -193,8 +193,9 @@ def reads_no_frame_after_the_training_part(learner: Learner) -> None:
         signal = getattr(data.recorded, name)
         changed[name] = torch.where(secret, 3.0 + 0.5 * signal, signal)
     poisoned = replace(data, recorded=replace(data.recorded, **changed))
-    one, two = _state(_fitted(learner, data)), _state(learner.fit(_POLICY, poisoned))
-    assert _equal(one, two), (
+    expected = _state(_fitted(learner, data))
+    delivered = _state(learner.fit(_POLICY, poisoned))
+    assert _equal(expected, delivered), (
         "frames after `split.frame` were changed, and the networks or their scaler changed with"
         " them: that is the test part, and results of a learner that reads it prove nothing"
     )
@@ -216,14 +217,16 @@ def networks_are_independent(learner: Learner) -> None:
         parameters = torch.where(of_first, default, labels.parameters)
         labels = replace(labels, parameters=parameters)
         other = replace(other, pairs=replace(other.pairs, labels=labels))
-    one, two = _state(_fitted(learner, data)), _state(learner.fit(_POLICY, other))
+    before, after = _state(_fitted(learner, data)), _state(learner.fit(_POLICY, other))
     message = (
         "what a network learns must not depend on the drivers of another network: one driver was"
         " changed, and another driver's network changed"
     )
-    for key in one:
-        own = len(one[key]) // PAIRS  # rows of one network, more than one in an ensemble
-        expect_close(one[key][own:], two[key][own:], rtol=1e-4, atol=1e-5, msg=f"{message} ({key})")
+    for key in before:
+        rows = len(before[key]) // PAIRS  # rows of one network, more than one in an ensemble
+        expect_close(
+            before[key][rows:], after[key][rows:], rtol=1e-4, atol=1e-5, msg=f"{message} ({key})"
+        )
 
 
 def the_training_data_stays_as_it_is(learner: Learner) -> None:
@@ -231,11 +234,11 @@ def the_training_data_stays_as_it_is(learner: Learner) -> None:
     _, data = _fit(learner, training_data(needs_labels=learner.needs_labels))
     message = "must not be changed in place: the protocol still needs it for the evaluation"
     for name in (*RECORDED, "gap"):
-        one, two = getattr(data.recorded, name), getattr(untouched.recorded, name)
-        assert torch.equal(one, two), f"recorded.{name} of the training data {message}"
+        after, before = getattr(data.recorded, name), getattr(untouched.recorded, name)
+        assert torch.equal(after, before), f"recorded.{name} of the training data {message}"
     for name in ("start", "network"):
-        one, two = getattr(data.pairs, name), getattr(untouched.pairs, name)
-        assert torch.equal(one, two), f"{name} of the training data {message}"
+        after, before = getattr(data.pairs, name), getattr(untouched.pairs, name)
+        assert torch.equal(after, before), f"{name} of the training data {message}"
     if data.pairs.labels is not None and untouched.pairs.labels is not None:
         assert torch.equal(data.pairs.labels.parameters, untouched.pairs.labels.parameters), (
             f"labels of the training data {message}"
@@ -252,8 +255,8 @@ def curves_tell_how_it_went(learner: Learner) -> None:
     assert set(curves["network"]) == set(data.names), (
         "every network has its curve, under its name in the training data"
     )
-    for name, own in curves.groupby("network"):
-        assert own["epoch"].tolist() == list(range(len(own))), (
+    for name, curve in curves.groupby("network"):
+        assert curve["epoch"].tolist() == list(range(len(curve))), (
             f"epochs of network {name} are counted 0, 1, 2, ..., a row each"
         )
     assert bool(curves["train_loss"].notna().all()), (
@@ -318,8 +321,10 @@ def _state(result: TrainingResult) -> dict[str, Tensor]:
     return {key: value.detach().clone() for key, value in values.items()}
 
 
-def _equal(one: dict[str, Tensor], two: dict[str, Tensor]) -> bool:
-    return one.keys() == two.keys() and all(torch.equal(one[key], two[key]) for key in one)
+def _equal(weights: dict[str, Tensor], others: dict[str, Tensor]) -> bool:
+    if weights.keys() != others.keys():
+        return False
+    return all(torch.equal(weights[key], others[key]) for key in weights)
 
 
 CONTRACT = contract_of(

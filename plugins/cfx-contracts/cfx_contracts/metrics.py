@@ -86,11 +86,11 @@ def single_precision_agrees_with_double(metric: Metric) -> None:
 def inputs_stay_as_they_are(metric: Metric) -> None:
     given, expected = trajectories(), trajectories()
     metric.compute(given)
-    for one in fields(given):
-        value = getattr(given, one.name)
+    for field in fields(given):
+        value = getattr(given, field.name)
         if isinstance(value, Tensor):
-            assert torch.equal(value, getattr(expected, one.name)), (
-                f"`compute` changed `{one.name}`, which every other metric reads too"
+            assert torch.equal(value, getattr(expected, field.name)), (
+                f"`compute` changed `{field.name}`, which every other metric reads too"
             )
 
 
@@ -101,10 +101,10 @@ def _flipped(marked: Tensor | None, where: Tensor) -> Tensor:
 
 def _of_pairs(given: Trajectories, index: Tensor) -> Trajectories:
     chosen: dict[str, Any] = {}
-    for one in fields(given):
-        value = getattr(given, one.name)
+    for field in fields(given):
+        value = getattr(given, field.name)
         if isinstance(value, Tensor):
-            chosen[one.name] = value[index]
+            chosen[field.name] = value[index]
     return replace(given, **chosen)
 
 

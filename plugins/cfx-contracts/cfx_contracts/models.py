@@ -136,10 +136,10 @@ def leaders_and_parameters_broadcast(model: DrivingModel) -> None:
         "leaders (P, 1) and parameters (P, 1) must broadcast over followers (P, q): q candidates"
         " behind one leader"
     )
-    one = model.next_speed(follower, leader, p, DT)
+    single = model.next_speed(follower, leader, p, DT)
     expect_close(
         speed,
-        one[:, None].expand(DRIVES, 3),
+        single[:, None].expand(DRIVES, 3),
         msg="broadcasting changes the numbers: a candidate must move the same beside others as"
         " alone",
     )

@@ -52,10 +52,10 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
     """
     from copier import run_copy
 
-    found = registry.kind_of(kind)
-    _check_template(found)
-    _check_name(found, name)
-    words = _words(found, name)
+    component_kind = registry.kind_of(kind)
+    _check_template(component_kind)
+    _check_name(component_kind, name)
+    words = _words(component_kind, name)
     target = (folder or Path(words["distribution"])).expanduser()
     if target.exists():
         raise OutputError(
@@ -65,7 +65,7 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
         target.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=target.parent, prefix=".cfx-new-") as temporary:
             draft = Path(temporary) / "package"
-            for part in ("common", found.name):
+            for part in ("common", component_kind.name):
                 template = str(_TEMPLATE / part)
                 run_copy(template, draft, data=words, defaults=True, overwrite=True, quiet=True)
             draft.rename(target)
@@ -74,7 +74,7 @@ def create(kind: str, name: str, folder: Path | None = None) -> Path:
             f"{target} cannot be written ({error.strerror or error});"
             " choose another folder with --folder"
         ) from error
-    print(_next_steps(found, name, target))
+    print(_next_steps(component_kind, name, target))
     return target
 
 

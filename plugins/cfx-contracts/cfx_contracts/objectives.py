@@ -127,16 +127,16 @@ def one_frame_needs_no_dimension_of_time(objective: Objective) -> None:
     whole = objective.terms(frames)
     assert isinstance(terms, tuple), "terms returns a tuple of tensors"
     assert len(terms) == len(whole), "terms returns as many tensors in every call"
-    for one, many in zip(terms, whole, strict=True):
+    for of_frame, many in zip(terms, whole, strict=True):
         expect_close(
-            one, many[0], msg="a rollout asks for the terms of one frame `(*batch,)` at a time"
+            of_frame, many[0], msg="a rollout asks for the terms of one frame `(*batch,)` at a time"
         )
 
 
 def it_is_the_metric_that_it_names(objective: Objective) -> None:
     if not objective.metric:
         return
-    metric = judged_by(MetricSet.of(["rmse_speed"]), objective).metrics[0].metric
+    metric = judged_by(MetricSet.of(["rmse_speed"]), objective).metrics[0].component
     frames = trajectories()
     expect_close(
         ObjectiveMetric("", objective).compute(frames),

@@ -120,8 +120,8 @@ def corner(candidates: Tensor, _: Tensor) -> Tensor:
 def recovers_a_known_optimum(optimizer: Optimizer, tolerance: float = TOLERANCE) -> None:
     optima = _random(8, 2, seed=11)
     for function in (distance, bowl):
-        found = _solve(optimizer, Problems(function, optima), n=2)
-        worst = torch.linalg.vector_norm(found.best - optima, dim=-1).max().item()
+        solution = _solve(optimizer, Problems(function, optima), n=2)
+        worst = torch.linalg.vector_norm(solution.best - optima, dim=-1).max().item()
         assert worst <= tolerance, (
             f"the optimum of a smooth function of two parameters must be found to {tolerance:g} in"
             " unit space, or calibration says nothing about the driver;"
@@ -133,12 +133,12 @@ def never_leaves_the_bounds(optimizer: Optimizer) -> None:
     for n, guesses, seed in ((1, 1, 0), (2, 3, 1), (3, 1, 1000), (5, 2, 7)):
         problems = Problems(rugged, 1.5 * _random(16, n, seed=seed) - 0.25)
         try:
-            found = _solve(optimizer, problems, n=n, guesses=guesses, seed=seed)
+            solution = _solve(optimizer, problems, n=n, guesses=guesses, seed=seed)
         except PluginError as error:
             raise AssertionError(
                 f"{error}: a model would drive with parameters outside its bounds"
             ) from error
-        for asked in [*problems.asked, found.best]:
+        for asked in [*problems.asked, solution.best]:
             inside = bool(((asked >= 0) & (asked <= 1)).all())
             assert inside, (
                 "a candidate lies outside [0, 1]: a model would drive with parameters outside its"
@@ -149,12 +149,12 @@ def never_leaves_the_bounds(optimizer: Optimizer) -> None:
 def survives_whatever_the_losses_are(optimizer: Optimizer) -> None:
     for function in (flat, zero, some_nan, some_infinite, all_nan, steps, enormous, corner):
         for n in (1, 3):
-            found = _solve(optimizer, Problems(function, _random(2, n, seed=5)), n=n)
+            solution = _solve(optimizer, Problems(function, _random(2, n, seed=5)), n=n)
             what = f" ('{function.__name__}' of {n} parameters)"
-            assert bool(found.best.isfinite().all()), (
+            assert bool(solution.best.isfinite().all()), (
                 f"the parameters of a window must be numbers whatever its losses are{what}"
             )
-            assert not bool(found.loss.isnan().any()), (
+            assert not bool(solution.loss.isnan().any()), (
                 "a loss is a number, or infinity where every candidate diverged, for means are"
                 f" taken over losses{what}"
             )
@@ -163,9 +163,9 @@ def survives_whatever_the_losses_are(optimizer: Optimizer) -> None:
 def survives_duplicate_guesses(optimizer: Optimizer) -> None:
     optima = _random(3, 2, seed=5)
     guesses = optima[:, None].expand(-1, 3, -1)
-    found = optimizer.minimize(Problems(distance, optima), guesses, seed=1)
+    solution = optimizer.minimize(Problems(distance, optima), guesses, seed=1)
     expect_close(
-        found.best,
+        solution.best,
         optima,
         msg="the guesses were the optimum, so it must be returned: what was evaluated and what is"
         " returned are the same numbers",
@@ -173,8 +173,8 @@ def survives_duplicate_guesses(optimizer: Optimizer) -> None:
 
 
 def finds_a_corner(optimizer: Optimizer, tolerance: float = TOLERANCE) -> None:
-    found = _solve(optimizer, Problems(corner, _random(3, 2, seed=5)), n=2)
-    reached = found.best.min().item()
+    solution = _solve(optimizer, Problems(corner, _random(3, 2, seed=5)), n=2)
+    reached = solution.best.min().item()
     assert reached >= 1 - 2 * tolerance, (
         "the best parameters of real drivers often lie at a bound, so the bounds must be within"
         f" reach; the optimum is the corner (1, 1), the optimizer stayed at {reached:.3g}"
@@ -183,17 +183,17 @@ def finds_a_corner(optimizer: Optimizer, tolerance: float = TOLERANCE) -> None:
 
 def a_problem_alone_and_all_diverged(optimizer: Optimizer) -> None:
     guess = torch.tensor([[[0.3, 0.6]]], dtype=torch.float64)
-    found = optimizer.minimize(Problems(all_nan, guess[:, 0]), guess, seed=1)
-    assert torch.equal(found.best, guess[:, 0]), (
+    solution = optimizer.minimize(Problems(all_nan, guess[:, 0]), guess, seed=1)
+    assert torch.equal(solution.best, guess[:, 0]), (
         "where every candidate diverges, the first guess stands: a window needs some parameters"
     )
-    assert bool(found.loss.isinf().all()), (
+    assert bool(solution.loss.isinf().all()), (
         "where every candidate diverges, the loss is infinity: nobody may take it for a result"
     )
-    assert found.diverged.tolist() == [optimizer.returned(2)], (
+    assert solution.diverged.tolist() == [optimizer.returned(2)], (
         "every diverged candidate is counted: users see which models fail within their bounds"
     )
-    assert found.sensitivity.tolist() == [0.0], (
+    assert solution.sensitivity.tolist() == [0.0], (
         "where every candidate diverges, nothing tells candidates apart: such a window must weigh"
         " nothing"
     )
@@ -204,12 +204,12 @@ def the_same_seed_gives_the_same_result(optimizer: Optimizer) -> None:
     for seed in (0, 7):
         with _kept_random_states():
             _set_random_states(1)
-            one = _solve(optimizer, Problems(rugged, optima), n=2, seed=seed)
+            first = _solve(optimizer, Problems(rugged, optima), n=2, seed=seed)
             _set_random_states(2)
             before = _random_states()
-            two = _solve(optimizer, Problems(rugged, optima), n=2, seed=seed)
+            second = _solve(optimizer, Problems(rugged, optima), n=2, seed=seed)
             after = _random_states()
-        assert torch.equal(one.best, two.best), (
+        assert torch.equal(first.best, second.best), (
             f"seed={seed} twice gave two results: randomness must come from `seed` alone, or no"
             " result can be repeated"
         )
@@ -280,12 +280,12 @@ def evaluates_exactly_what_it_says(optimizer: Optimizer) -> None:
 
 
 def measures_the_sensitivity_where_parameters_matter(optimizer: Optimizer) -> None:
-    found = _solve(optimizer, Problems(distance, _random(3, 2, seed=5)), n=2, guesses=1)
-    low, median, high = found.filling.unbind(1)
+    solution = _solve(optimizer, Problems(distance, _random(3, 2, seed=5)), n=2, guesses=1)
+    low, median, high = solution.filling.unbind(1)
     assert bool((low <= median).all() and (median <= high).all()), (
         "filling holds the lowest, median and highest loss"
     )
-    assert bool((found.sensitivity > 0).all()), (
+    assert bool((solution.sensitivity > 0).all()), (
         "where the choice of parameters matters, the sensitivity is positive"
     )
 
@@ -293,25 +293,25 @@ def measures_the_sensitivity_where_parameters_matter(optimizer: Optimizer) -> No
 def ties_go_to_the_first_guess(optimizer: Optimizer) -> None:
     guesses = _random(3, 2, 2, seed=6)
     for function in (flat, zero):
-        found = optimizer.minimize(Problems(function, guesses[:, 0]), guesses, seed=1)
-        assert torch.equal(found.best, guesses[:, 0]), (
+        solution = optimizer.minimize(Problems(function, guesses[:, 0]), guesses, seed=1)
+        assert torch.equal(solution.best, guesses[:, 0]), (
             "a window that says nothing about the parameters keeps the first guess"
         )
-        assert found.sensitivity.tolist() == [0.0] * 3, (
+        assert solution.sensitivity.tolist() == [0.0] * 3, (
             "a window that says nothing about the parameters has a sensitivity of 0"
         )
 
 
 def returns_the_loss_of_what_it_returns(optimizer: Optimizer) -> None:
     problems, guesses = Problems(bowl, _random(4, 3, seed=5)), _random(4, 2, 3, seed=6)
-    found = optimizer.minimize(problems, guesses, seed=1)
+    solution = optimizer.minimize(problems, guesses, seed=1)
     expect_close(
-        problems(found.best[:, None])[:, 0],
-        found.loss,
+        problems(solution.best[:, None])[:, 0],
+        solution.loss,
         msg="`loss` must be the loss of `best`: candidates and losses that are returned belong"
         " together",
     )
-    assert bool((found.loss <= problems(guesses).amin(dim=1) * (1 + 1e-5)).all()), (
+    assert bool((solution.loss <= problems(guesses).amin(dim=1) * (1 + 1e-5)).all()), (
         "the result is worse than a guess, which was evaluated too"
     )
 

@@ -93,9 +93,9 @@ def state_is_passed_not_kept(policy: Policy) -> None:
 
 def the_same_generator_gives_the_same_weights(policy: Policy) -> None:
     features = features_of(policy)
-    one = build(policy, features, seed=3).state_dict()
-    two = build(policy, features, seed=3).state_dict()
-    assert all(torch.equal(one[key], two[key]) for key in one), (
+    first = build(policy, features, seed=3).state_dict()
+    second = build(policy, features, seed=3).state_dict()
+    assert all(torch.equal(first[key], second[key]) for key in first), (
         "initial weights must come from the generator alone, or no training can be repeated"
     )
 

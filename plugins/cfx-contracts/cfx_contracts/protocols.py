@@ -77,15 +77,15 @@ def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
     assert isinstance(protocol_result, ProtocolResult), (
         f"`run` must return a cfx.plugin.ProtocolResult, not a {type(protocol_result).__name__}"
     )
-    for one in protocol_result.evaluation.trajectories:
-        where = f"(pair {one.pair_id})"
+    for pair in protocol_result.evaluation.trajectories:
+        where = f"(pair {pair.pair_id})"
         for method in protocol_result.evaluation.methods:
-            speed, gap = one.speed[method], one.gap[method]
-            assert len(speed) == len(gap) == len(one.time) == len(one.real_speed), (
+            speed, gap = pair.speed[method], pair.gap[method]
+            assert len(speed) == len(gap) == len(pair.time) == len(pair.real_speed), (
                 "every method is simulated over the same frames, or their errors cannot be"
-                f" compared; {method} has {len(speed)} of {len(one.time)} {where}"
+                f" compared; {method} has {len(speed)} of {len(pair.time)} {where}"
             )
-            begin = (one.real_speed[0], one.real_gap[0])
+            begin = (pair.real_speed[0], pair.real_gap[0])
             assert (speed[0], gap[0]) == begin, (
                 f"every method starts from the last measured state; {method} does not {where}"
             )
@@ -125,7 +125,7 @@ def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
     assert len(counts) == len(evaluation.methods) * evaluation.table["pair_id"].nunique(), (
         "every method is tested on every pair"
     )
-    simulated = {one.pair_id for one in evaluation.trajectories}
+    simulated = {pair.pair_id for pair in evaluation.trajectories}
     assert simulated == set(evaluation.table["pair_id"]), (
         "the trajectories are those that the table measures"
     )
@@ -170,10 +170,10 @@ def nothing_is_found_or_learned_from_the_test_part(protocol: Protocol) -> None:
 def the_same_seed_gives_the_same_result(protocol: Protocol) -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
-        one = _protocol_result(protocol)
+        first = _protocol_result(protocol)
         torch.manual_seed(2)
-        two = protocol.run(context(recording()))
-    assert one.evaluation.table.equals(two.evaluation.table), (
+        second = protocol.run(context(recording()))
+    assert first.evaluation.table.equals(second.evaluation.table), (
         "the same context twice gave two results: randomness must come from `context.seed` alone"
     )
 
@@ -246,7 +246,7 @@ class _Refusing(ImitationLearner):
 
 
 def _trajectories(protocol_result: ProtocolResult) -> dict[str, PairTrajectory]:
-    return {one.pair_id: one for one in protocol_result.evaluation.trajectories}
+    return {pair.pair_id: pair for pair in protocol_result.evaluation.trajectories}
 
 
 def _poisoned(pairs: PairSet, tested: PairTrajectory, *, leader: bool) -> PairSet:

@@ -149,17 +149,17 @@ def leaders_and_parameters_broadcast(simulator: Simulator, model: Model = None) 
 def sees_no_later_frame_of_the_leader(simulator: Simulator, model: Model = None) -> None:
     stepper, scene = _ready(simulator, model)
     _, _, expected = _advance(stepper, scene)
-    known = STEPS // 2
-    later = torch.arange(STEPS)[:, None] >= known
+    change = STEPS // 2
+    later = torch.arange(STEPS)[:, None] >= change
     leader = scene.leader._replace(
         speed=torch.where(later, 0.5 * scene.leader.speed, scene.leader.speed),
         acceleration=torch.where(later, -1.0, scene.leader.acceleration),
     )
     _, _, speed = _advance(stepper, scene._replace(leader=leader))
     _close(
-        speed[:known],
-        expected[:known],
-        f"what the leader does from frame {known} on must not change the speeds up to there: a"
+        speed[:change],
+        expected[:change],
+        f"what the leader does from frame {change} on must not change the speeds up to there: a"
         " driver sees no future",
     )
 
@@ -260,9 +260,9 @@ def _scene(model: DrivingModel) -> _Scene:
     speed = (first + acceleration.cumsum(0) * DT).clamp(min=0.0)
     position = 100.0 + (speed * DT).cumsum(0)
     length = uniform(4.0, 9.0, FOLLOWERS)
-    own = (first + uniform(-2.0, 2.0, FOLLOWERS)).clamp(min=0.0)
-    behind = position[0] - length - 5.0 - 1.5 * own
-    start = Start(behind, own, uniform(-1.0, 1.0, FOLLOWERS))
+    begin = (first + uniform(-2.0, 2.0, FOLLOWERS)).clamp(min=0.0)
+    behind = position[0] - length - 5.0 - 1.5 * begin
+    start = Start(behind, begin, uniform(-1.0, 1.0, FOLLOWERS))
     unit = uniform(0.0, 1.0, FOLLOWERS, len(model.space))
     p = model.space.unpack(model.space.from_unit(unit))
     return _Scene(start, Leader(position, speed, acceleration, length), p)

@@ -206,13 +206,13 @@ def distribution_metrics(table: pd.DataFrame) -> dict[str, float]:
 
     What is not defined is left out, as the coverage of one path.
     """
-    found = {}
+    metrics = {}
     for row in summarize_distributions(table).to_dict("records"):
         for column, value in row.items():
             if column in ("method", "horizon_s") or not np.isfinite(value):
                 continue
-            found[f"distribution/{column}_{row['horizon_s']:g}s/{row['method']}"] = float(value)
-    return found
+            metrics[f"distribution/{column}_{row['horizon_s']:g}s/{row['method']}"] = float(value)
+    return metrics
 
 
 def sampled_methods(table: pd.DataFrame) -> tuple[str, ...]:
@@ -247,7 +247,7 @@ def _scores(sampled: Sampled, recorded: Recorded, step: int, dt: float) -> dict[
     """Returns the scores at one step, `(Q,)` each."""
     speed, truth = sampled.speed[:, :, step], recorded.speed[:, step]
     off = np.abs(sampled.travelled - recorded.travelled)[:_OF_SIX, :, 1 : step + 1]
-    found = {
+    scores = {
         "crps_speed": _crps(speed, truth),
         # Behind a given leader an error of the gap is one of the distance travelled.
         "crps_gap": _crps(sampled.travelled[:, :, step], recorded.travelled[:, step]),
@@ -260,8 +260,8 @@ def _scores(sampled: Sampled, recorded: Recorded, step: int, dt: float) -> dict[
     happened = _signals(recorded.speed[None], recorded.travelled[None], recorded, step, dt)
     for name, (low, high, bins) in LIKELIHOODS.items():
         edges = np.linspace(low, high, bins + 1)[1:-1]
-        found[f"likelihood_{name}"] = _likelihood(simulated[name], happened[name][0], edges)
-    return found
+        scores[f"likelihood_{name}"] = _likelihood(simulated[name], happened[name][0], edges)
+    return scores
 
 
 def _crps(sampled: Array, truth: Array) -> Array:
@@ -270,8 +270,8 @@ def _crps(sampled: Array, truth: Array) -> Array:
 
     if len(sampled) == 1:
         return np.asarray(np.abs(sampled[0] - truth))
-    found = scoringrules.crps_ensemble(truth, sampled, m_axis=0, estimator="fair", backend="numpy")
-    return np.asarray(found)
+    crps = scoringrules.crps_ensemble(truth, sampled, m_axis=0, estimator="fair", backend="numpy")
+    return np.asarray(crps)
 
 
 def _energy(sampled: Array, truth: Array, step: int, dt: float) -> Array:

@@ -92,15 +92,15 @@ def forecast_metrics(table: pd.DataFrame) -> dict[str, float]:
     Args:
         table: of single forecasts.
     """
-    found = {}
+    metrics = {}
     for row in summarize_forecasts(table).to_dict("records"):
         for error in ERRORS:
             key = f"{SCOPE}/{metric_name(error, row['horizon_s'])}/{row['method']}"
-            found[key] = float(row[error])
+            metrics[key] = float(row[error])
             for end in ("low", "high"):
                 if error in _QUADRATIC:
-                    found[f"{key}/ci95_{end}"] = float(row[f"{error}_{end}"])
-    return found
+                    metrics[f"{key}/ci95_{end}"] = float(row[f"{error}_{end}"])
+    return metrics
 
 
 def metric_name(error: str, horizon: float) -> str:
@@ -111,8 +111,8 @@ def metric_name(error: str, horizon: float) -> str:
 def forecast_methods(table: pd.DataFrame) -> tuple[str, ...]:
     """Returns the methods of a table of forecasts in the order in which they are shown."""
     present = table["method"].astype(str).unique().tolist()
-    known = [method for method in FORECAST_METHODS if method in present]
-    return (*known, *(method for method in present if method not in known))
+    ordered = [method for method in FORECAST_METHODS if method in present]
+    return (*ordered, *(method for method in present if method not in ordered))
 
 
 def forecast_errors(
@@ -173,11 +173,11 @@ def errors_by(table: pd.DataFrame, groups: Sequence[str]) -> pd.DataFrame:
         fde=table["position_error"].abs(),
     )
     grouped = squares.groupby(list(groups), sort=False, observed=True)
-    found = grouped[list(ERRORS)].mean()
+    means = grouped[list(ERRORS)].mean()
     for error in _QUADRATIC:
-        found[error] = np.sqrt(found[error])
-    found["origins"] = grouped.size()
-    return found.reset_index()
+        means[error] = np.sqrt(means[error])
+    means["origins"] = grouped.size()
+    return means.reset_index()
 
 
 def summarize_forecasts(table: pd.DataFrame, by: str = "horizon_s") -> pd.DataFrame:
@@ -194,14 +194,14 @@ def summarize_forecasts(table: pd.DataFrame, by: str = "horizon_s") -> pd.DataFr
     """
     rows = []
     of_driver = errors_by(table, ["method", by, "driver"])
-    for (method, value), found in of_driver.groupby(["method", by], sort=False, observed=True):
+    for (method, value), errors in of_driver.groupby(["method", by], sort=False, observed=True):
         row: dict[str, object] = {"method": method, by: value}
-        row |= {error: float(found[error].mean()) for error in ERRORS}
-        drivers = found["driver"].astype(str).tolist()
+        row |= {error: float(errors[error].mean()) for error in ERRORS}
+        drivers = errors["driver"].astype(str).tolist()
         for error in _QUADRATIC:
-            _, low, high = statistics.mean_interval(found[error].tolist(), drivers)
+            _, low, high = statistics.mean_interval(errors[error].tolist(), drivers)
             row |= {f"{error}_low": low, f"{error}_high": high}
-        row |= {"drivers": len(found), "origins": int(found["origins"].sum())}
+        row |= {"drivers": len(errors), "origins": int(errors["origins"].sum())}
         rows.append(row)
     return pd.DataFrame(rows)
 
@@ -228,11 +228,11 @@ def errors_by_history(table: pd.DataFrame) -> pd.DataFrame:
     groups = ["method", "horizon_s", "span_s", "driver"]
     of_driver = errors_by(table.assign(span_s=middle), groups)
     grouped = of_driver.groupby(groups[:-1], sort=False, observed=True)
-    found = grouped[list(ERRORS)].mean()
-    found["drivers"] = grouped.size()
-    found = found.reset_index().sort_values("span_s", kind="stable")
-    enough = found["drivers"] >= 0.5 * table["driver"].nunique()
-    return found[enough].reset_index(drop=True)
+    means = grouped[list(ERRORS)].mean()
+    means["drivers"] = grouped.size()
+    means = means.reset_index().sort_values("span_s", kind="stable")
+    enough = means["drivers"] >= 0.5 * table["driver"].nunique()
+    return means[enough].reset_index(drop=True)
 
 
 def _array(values: Tensor) -> np.ndarray:

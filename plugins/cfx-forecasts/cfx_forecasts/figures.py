@@ -93,11 +93,11 @@ def pit_density(rows: pd.DataFrame) -> canvas.Array:
 
     Where reality lies among the sampled speeds, from 0 to 1; 1 everywhere if all is well.
     """
-    found = []
+    densities = []
     for _, of_driver in rows.groupby("driver"):
         counts, _ = np.histogram(of_driver["pit"], bins=PIT_BINS, range=(0.0, 1.0))
-        found.append(PIT_BINS * counts / max(1, counts.sum()))
-    return np.asarray(np.mean(found, axis=0))
+        densities.append(PIT_BINS * counts / max(1, counts.sum()))
+    return np.asarray(np.mean(densities, axis=0))
 
 
 @canvas.styled

@@ -30,27 +30,27 @@ from cfx_forecasts.residuals import measure_residuals
 log = logging.getLogger(__name__)
 
 
-def residual_noise(test: HeldOut, parameters: Tensor, *, own: bool) -> tuple[Tensor, Tensor]:
+def residual_noise(test: HeldOut, parameters: Tensor, *, of_driver: bool) -> tuple[Tensor, Tensor]:
     """Returns the AR(1) process of each driver's residual: time, s, and scale, m/s2, `(P,)` each.
 
     Args:
         test: the drivers, of whom what was measured before the first origin is read.
         parameters: `(P, n)`.
-        own: measured on each driver; otherwise the mean over those of the other folds, or over all
-            test drivers where there are no folds.
+        of_driver: True: measured on each driver. False: the mean over the drivers of the other
+            folds; over all test drivers where there are no folds.
     """
     model, windows = test.context.stepper.model, test.context.windows
     lag = windows.stride * test.batch.dt
-    found = measure_residuals(model, test.batch, parameters, test.first, lag)
-    usual = found.time.nanmean().nan_to_num(composed.RELAXATION_TIME.default)
-    time = torch.where(found.time.isnan(), usual, found.time)
-    if own:
-        return time, found.scale
+    residuals = measure_residuals(model, test.batch, parameters, test.first, lag)
+    usual = residuals.time.nanmean().nan_to_num(composed.RELAXATION_TIME.default)
+    time = torch.where(residuals.time.isnan(), usual, residuals.time)
+    if of_driver:
+        return time, residuals.scale
     others = (test.network[:, None] != test.network[None, :]).to(time)
     if not bool(others.any()):
         others = torch.ones_like(others)
     share = others / others.sum(1, keepdim=True)
-    return share @ time, (share @ found.scale.square()).sqrt()
+    return share @ time, (share @ residuals.scale.square()).sqrt()
 
 
 def constant_with_noise(

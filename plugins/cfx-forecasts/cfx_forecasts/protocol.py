@@ -194,7 +194,7 @@ class Forecast(FoldsOrFinished):
         """Logs how many drivers there are forecasts of, and horizons that few or none reach."""
         drivers = np.asarray([pair.driver for pair in test.pairs], dtype=object)
         left = test.batch.lengths[origins.pair] - 1 - origins.frame
-        known = len(set(drivers))
+        all_drivers = len(set(drivers))
         counts = {}
         for horizon in self.settings.horizons:
             reached = left >= round(horizon / test.batch.dt)
@@ -204,12 +204,14 @@ class Forecast(FoldsOrFinished):
             len(origins),
             counts[self.settings.horizons[0]],
         )
-        short = [f"{horizon:g} s ({count})" for horizon, count in counts.items() if count < known]
+        short = [
+            f"{horizon:g} s ({count})" for horizon, count in counts.items() if count < all_drivers
+        ]
         if short:
             log.info(
                 "The recordings of some of the %d drivers end before these horizons (drivers that"
                 " count): %s. A smaller split or protocol.min_history leaves more to forecast",
-                known,
+                all_drivers,
                 ", ".join(short),
             )
 
@@ -221,11 +223,11 @@ class Forecast(FoldsOrFinished):
         context = test.context
         first = torch.full_like(test.first, round(seconds / test.batch.dt))
         first = torch.minimum(first, test.batch.lengths - 2)
-        own = context.calibrator.driver_specific(test.pairs, test.batch, first.cpu())
+        recalibrated = context.calibrator.driver_specific(test.pairs, test.batch, first.cpu())
         base = test.base
         if base is not None:
-            base = base_of(test.policy, own)
-        return replace(test, first=first, driver_specific=own, base=base)
+            base = base_of(test.policy, recalibrated)
+        return replace(test, first=first, driver_specific=recalibrated, base=base)
 
     def _paths(
         self, test: HeldOut, origins: forecasts.Origins, steps: int
@@ -252,8 +254,8 @@ class Forecast(FoldsOrFinished):
             if can_drive(context.stepper, agent):
                 agents[name] = (agent, network)
         for name, (agent, network) in agents.items():
-            found = self._from_origins(test, agent, origins, steps, network, (None,))
-            paths[name] = forecasts.Paths(found.speed[0], found.travelled[0])
+            simulated = self._from_origins(test, agent, origins, steps, network, (None,))
+            paths[name] = forecasts.Paths(simulated.speed[0], simulated.travelled[0])
         return paths
 
     def _sampled(
@@ -263,7 +265,7 @@ class Forecast(FoldsOrFinished):
         context, each = test.context, torch.arange(len(test.batch), device=origins.pair.device)
         agents = {}
         for name, parameters in _constants(test).items():
-            noise = residual_noise(test, parameters, own=name == "driver_specific")
+            noise = residual_noise(test, parameters, of_driver=name == "driver_specific")
             agent = constant_with_noise(context, parameters, *noise)
             if can_drive(context.stepper, agent):
                 agents[f"{name}_ar"] = (agent, each)
@@ -307,7 +309,7 @@ def _constants(test: HeldOut) -> dict[str, Tensor]:
     """Returns constant parameters of each test driver, `(P, n)`, that a residual can go with."""
     if test.context.stepper.model.needs_simulator:
         return {}
-    found = {"driver_specific": test.driver_specific}
+    parameters = {"driver_specific": test.driver_specific}
     if test.pooled is not None:
-        found["pooled"] = test.pooled[test.network]
-    return found
+        parameters["pooled"] = test.pooled[test.network]
+    return parameters

@@ -59,7 +59,7 @@ over drivers. Origins of one driver overlap, so they are never counted as indepe
 
     def context(self, runs: Runs) -> Mapping[str, Any] | None:
         """Return tables for each job with forecasts."""
-        found = []
+        blocks = []
         methods: list[str] = []
         for job in runs.jobs:
             table = job.tables.get("forecasts")
@@ -67,9 +67,9 @@ over drivers. Origins of one driver overlap, so they are never counted as indepe
                 leader = _LEADERS.get(str(job.setting("protocol.leader")), "")
                 speed = errors(job, table, "rmse_speed", "m/s")
                 position = errors(job, table, "rmse_position", "m")
-                found.append({"job": job, "leader": leader, "speed": speed, "position": position})
+                blocks.append({"job": job, "leader": leader, "speed": speed, "position": position})
                 methods += forecast_methods(table)
-        return {"forecasts": found, "methods": methods_explained(methods)} if found else None
+        return {"forecasts": blocks, "methods": methods_explained(methods)} if blocks else None
 
 
 def errors(job: Result, table: pd.DataFrame, error: str, unit: str) -> Sheet:
@@ -126,14 +126,14 @@ is its absolute error, so the policy's centre, where nothing is drawn, can stand
 
     def context(self, runs: Runs) -> Mapping[str, Any] | None:
         """Return a table for each job with sampled forecasts."""
-        found = []
+        blocks = []
         methods: list[str] = []
         for job in runs.jobs:
             if {"distributions", "forecasts"} <= set(job.tables):
                 sheet = crps_sheet(job.tables["distributions"], job.tables["forecasts"])
-                found.append((job, sheet))
+                blocks.append((job, sheet))
                 methods += _names(job.tables["distributions"])
-        return {"sampled": found, "methods": methods_explained(methods)} if found else None
+        return {"sampled": blocks, "methods": methods_explained(methods)} if blocks else None
 
 
 def crps_sheet(table: pd.DataFrame, forecasts: pd.DataFrame) -> Sheet:

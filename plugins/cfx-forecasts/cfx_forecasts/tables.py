@@ -93,9 +93,9 @@ class Distributions(ResultTable):
             crps[heading] = (f"distribution/crps_speed_{horizon:g}s", ".3f")
             coverage[heading] = (f"distribution/coverage_{horizon:g}s", ".0%")
         title = "Sampled forecasts: CRPS of speed (m/s) after"
-        found = metrics_table(title, methods, crps, metrics)
+        table = metrics_table(title, methods, crps, metrics)
         centre = centre_errors(tables["forecasts"]).set_index("horizon_s")["crps_speed"]
         errors = [centre.get(horizon) for horizon in horizons]
-        found.add_row("policy's centre", *("" if e is None else f"{e:.3f}" for e in errors))
+        table.add_row("policy's centre", *("" if e is None else f"{e:.3f}" for e in errors))
         title = f"Sampled forecasts: coverage of the central {LEVEL:.0%} after"
-        return [found, metrics_table(title, methods, coverage, metrics)]
+        return [table, metrics_table(title, methods, coverage, metrics)]

@@ -62,8 +62,8 @@ def normal_draws(
 ) -> Tensor:
     """Returns draws `(count, n)` of a normal distribution with a mean `(n,)`."""
     normal = torch.randn((count, len(mean)), generator=generator, dtype=torch.float64)
-    found: Tensor = mean + normal @ torch.linalg.cholesky(covariance).mT
-    return found
+    draws: Tensor = mean + normal @ torch.linalg.cholesky(covariance).mT
+    return draws
 
 
 @dataclass(frozen=True)
@@ -113,8 +113,8 @@ class ParameterPrior:
             return torch.logit(shares)[:, None].expand(-1, n)
         normal = torch.special.ndtri(shares)[:, None]
         deviation = torch.linalg.inv(self.precision).diagonal().sqrt()
-        found: Tensor = self.center.reshape(-1, n).mean(0) + normal * deviation
-        return found
+        values: Tensor = self.center.reshape(-1, n).mean(0) + normal * deviation
+        return values
 
     def draw(self, drivers: int, n: int, *, seed: int) -> Tensor:
         """Returns logits of drivers before their recordings, `(drivers, n)`."""
@@ -225,13 +225,13 @@ class Posterior:
         errors = SignalErrors(self.signal)
         terms = Terms(errors, ComponentKey(SignalErrors, self.signal))
         stepper = self.segments.stepper
-        found = stepper.accumulate(self.segments.segments, p, terms, self.stride, gain)
-        if found is None and gain is None:
+        accumulated = stepper.accumulate(self.segments.segments, p, terms, self.stride, gain)
+        if accumulated is None and gain is None:
             frames = self.segments.simulated(p, gap=self.signal == "gap")
-            found = (errors(*frames[:4])[0][self.stride - 1 :: self.stride],)
-        elif found is None:
-            found = (self._predicted(place),)
-        return torch.where(self.counted > 0, found[0], 0.0)
+            accumulated = (errors(*frames[:4])[0][self.stride - 1 :: self.stride],)
+        elif accumulated is None:
+            accumulated = (self._predicted(place),)
+        return torch.where(self.counted > 0, accumulated[0], 0.0)
 
     def predictor(self, place: Tensor) -> Predictor:
         """Returns what predicts recordings at coordinates `(P, q, s)`, or more, step by step."""
@@ -242,13 +242,13 @@ class Posterior:
 
     def _predicted(self, place: Tensor) -> Tensor:
         """Returns errors of predictions that are corrected after each step, `(K, P, q)`."""
-        predictor, found = self.predictor(place), []
+        predictor, errors = self.predictor(place), []
         for _ in range(self.segments.steps // self.stride):
             predicted, measured = predictor.advance()
             error = predicted - measured
-            found.append(error)
+            errors.append(error)
             predictor.correct(error, torch.ones_like(error, dtype=torch.bool))
-        return torch.stack(found)
+        return torch.stack(errors)
 
     def residual(self, place: Tensor) -> Tensor:
         """Returns what noise leaves of the errors of coordinates `(P, q, d)`, `(K, P, q)`."""
@@ -298,23 +298,23 @@ class Posterior:
 
     def prior_deviation(self) -> Tensor:
         """Returns standard deviations of coordinates a priori, `(s,)`."""
-        found = torch.linalg.inv(self.prior.precision).diagonal().sqrt()
+        deviation = torch.linalg.inv(self.prior.precision).diagonal().sqrt()
         # That of a logistic distribution.
         gain = torch.full((self.kind.simulated,), math.pi / math.sqrt(3.0), dtype=torch.float64)
-        return torch.cat([found, gain])
+        return torch.cat([deviation, gain])
 
     def prior_quantiles(self, shares: Tensor) -> Tensor:
         """Returns quantiles of each coordinate a priori, `(len(shares), s)`."""
-        found = self.prior.quantiles(shares, len(self.space))
+        quantiles = self.prior.quantiles(shares, len(self.space))
         gain = torch.logit(shares)[:, None].expand(-1, self.kind.simulated)
-        return torch.cat([found, gain], dim=-1)
+        return torch.cat([quantiles, gain], dim=-1)
 
     def prior_draw(self, count: int, *, seed: int) -> Tensor:
         """Returns coordinates of drivers before their recordings, `(count, s)`."""
-        found = self.prior.draw(count, len(self.space), seed=seed)
+        logits = self.prior.draw(count, len(self.space), seed=seed)
         generator = torch.Generator().manual_seed(seed + 1)
         gain = torch.rand((count, self.kind.simulated), generator=generator, dtype=torch.float64)
-        return torch.cat([found, torch.logit(gain, eps=1e-12)], dim=-1)
+        return torch.cat([logits, torch.logit(gain, eps=1e-12)], dim=-1)
 
     def with_slope(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the log density whatever the noise's scale, `(P, q)`, and its slope.
@@ -331,9 +331,9 @@ class Posterior:
         products = self.products(asked)
         products = products.view(*moved.shape[:3], *products.shape[-2:])
         with torch.enable_grad():
-            own = place[..., None, s:].detach().requires_grad_()
-            density = noise.marginal_log_density(products, self.count[..., None], own)
-            (of_noise,) = torch.autograd.grad(density[..., 0].sum(), own)
+            of_noise_model = place[..., None, s:].detach().requires_grad_()
+            density = noise.marginal_log_density(products, self.count[..., None], of_noise_model)
+            (of_noise,) = torch.autograd.grad(density[..., 0].sum(), of_noise_model)
         density = density.detach() + self.prior_log_density(asked).view_as(density)
         of_simulated = (density[..., 1:] - density[..., :1]) / DIFFERENCE
         return density[..., 0], torch.cat([of_simulated, of_noise[..., 0, :]], dim=-1)

@@ -69,9 +69,9 @@ class Fan(NamedTuple):
             return (is_in & after[..., None]).sum(1) / count[:, None]
 
         held = within(self.measured[..., None])[:, 0]
-        own = within(self.paths)
-        as_little = (own < held[:, None]).double().mean(1)
-        the_same = (own == held[:, None]).double().mean(1)
+        shares = within(self.paths)
+        as_little = (shares < held[:, None]).double().mean(1)
+        the_same = (shares == held[:, None]).double().mean(1)
         generator = torch.Generator().manual_seed(seed)
         part = torch.rand(len(held), generator=generator, dtype=torch.float64)
         chance = torch.where(count > 0, as_little + part * the_same, torch.nan)
@@ -141,8 +141,8 @@ def _paths(part: Posterior, calibrated: Tensor, draws: Tensor, seed: int) -> Ten
         seed: of the noise. All drivers have the same random numbers: none depends on who is worked
             on beside them.
     """
-    own = draws[..., part.simulated :]
-    coefficients, scale = noise.coefficients(own[..., :-1]), own[..., -1].exp()
+    noise_values = draws[..., part.simulated :]
+    coefficients, scale = noise.coefficients(noise_values[..., :-1]), noise_values[..., -1].exp()
     generator = torch.Generator().manual_seed(seed)
     predictor = part.predictor(draws)
     errors: list[Tensor] = []
@@ -153,10 +153,10 @@ def _paths(part: Posterior, calibrated: Tensor, draws: Tensor, seed: int) -> Ten
         expected = scale * drawn
         for back in range(min(step, part.order)):
             expected = expected + coefficients[..., back] * errors[step - 1 - back]
-        known = calibrated[:, step, None]
-        error = torch.where(known, predicted - measured, expected)
-        predictor.correct(error, known)
+        is_calibrated = calibrated[:, step, None]
+        error = torch.where(is_calibrated, predicted - measured, expected)
+        predictor.correct(error, is_calibrated)
         errors.append(error)
         # Errors are predicted minus measured: what is measured is predicted minus noise.
-        paths.append(torch.where(known, predicted, predicted - error))
+        paths.append(torch.where(is_calibrated, predicted, predicted - error))
     return torch.stack(paths, dim=1)

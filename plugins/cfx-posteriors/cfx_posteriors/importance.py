@@ -116,13 +116,13 @@ class Components(NamedTuple):
         d = places.shape[-1]
         whole = math.lgamma((_FREEDOM + d) / 2) - math.lgamma(_FREEDOM / 2)
         whole -= 0.5 * d * math.log(_FREEDOM * math.pi)
-        found = []
+        densities = []
         for location, factor in zip(self.location.unbind(1), self.factor.unbind(1), strict=True):
             away = (places - location[:, None]).mT
             squares = torch.linalg.solve_triangular(factor, away, upper=False).square().sum(-2)
             size = torch.diagonal(factor, dim1=1, dim2=2).log().sum(-1)[:, None]
-            found.append(whole - size - 0.5 * (_FREEDOM + d) * torch.log1p(squares / _FREEDOM))
-        return (torch.stack(found) + self.share.log().mT[..., None]).logsumexp(0)
+            densities.append(whole - size - 0.5 * (_FREEDOM + d) * torch.log1p(squares / _FREEDOM))
+        return (torch.stack(densities) + self.share.log().mT[..., None]).logsumexp(0)
 
     def draw(self, generator: torch.Generator) -> Tensor:
         """Returns `SAMPLES` of each share of each component, `(P, N, d)`.
@@ -176,40 +176,40 @@ def sample(
     size = max(1, memory // (2 * drawn * posterior.bytes_per_candidate + 4 * kept))
     parts = []
     for drivers in torch.split(torch.arange(len(normal.mode)), size):
-        own = Normal(*(values[drivers] for values in normal))
-        parts.append(_sampled(posterior.take(drivers), own, shares, seed))
+        approximation = Normal(*(values[drivers] for values in normal))
+        parts.append(_sampled(posterior.take(drivers), approximation, shares, seed))
     return Sampled(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 
 def _sampled(posterior: Posterior, normal: Normal, shares: Tensor, seed: int) -> Sampled:
-    found: list[tuple[Tensor, Sampled]] = []
+    parts: list[tuple[Tensor, Sampled]] = []
     for drivers, weighted, smoothed, k in _finished(posterior, normal, seed):
         weights = smoothed.exp()
         generator = torch.Generator().manual_seed(seed)
         draws = systematic(weighted.places, weights, DRAWS, generator)
         n = len(posterior.space)
         quantiles = weighted_quantiles(weighted.places[..., :n], weights, shares)
-        found.append((drivers, Sampled(quantiles, draws, effective_size(smoothed), k)))
-    order = torch.cat([drivers for drivers, _ in found]).argsort()
-    together = zip(*(part for _, part in found), strict=True)
+        parts.append((drivers, Sampled(quantiles, draws, effective_size(smoothed), k)))
+    order = torch.cat([drivers for drivers, _ in parts]).argsort()
+    together = zip(*(part for _, part in parts), strict=True)
     return _mended(
         posterior, Sampled(*(torch.cat(values)[order] for values in together)), seed, shares
     )
 
 
-def _mended(posterior: Posterior, found: Sampled, seed: int, shares: Tensor) -> Sampled:
+def _mended(posterior: Posterior, sampled: Sampled, seed: int, shares: Tensor) -> Sampled:
     """Returns tempered samples of the drivers whose weighted ones do not settle."""
-    doubtful = (~found.reliable).nonzero()[:, 0]
+    doubtful = (~sampled.reliable).nonzero()[:, 0]
     if len(doubtful) == 0:
-        return found
+        return sampled
     places = tempered(posterior.take(doubtful), seed)
     generator = torch.Generator().manual_seed(seed)
     kept = torch.randperm(places.shape[1], generator=generator)[:DRAWS]
     n = len(posterior.space)
     quantiles = places[..., :n].quantile(shares, dim=1).transpose(0, 1)
-    return found._replace(
-        quantiles=found.quantiles.index_copy(0, doubtful, quantiles),
-        draws=found.draws.index_copy(0, doubtful, places[:, kept]),
+    return sampled._replace(
+        quantiles=sampled.quantiles.index_copy(0, doubtful, quantiles),
+        draws=sampled.draws.index_copy(0, doubtful, places[:, kept]),
     )
 
 

@@ -117,18 +117,18 @@ class ParameterIntervals(DriverPosteriors):
 
     def columns(self) -> dict[str, NDArray[Any]]:
         """Returns columns for a row per driver: `median_NAME`, `noise_scale` and so on."""
-        found: dict[str, NDArray[Any]] = {}
+        by_name: dict[str, NDArray[Any]] = {}
         for kind in ("median", "low", "high", "contraction"):
             for number, name in enumerate(self.names):
-                found[f"{kind}_{name}"] = getattr(self, kind)[:, number].numpy()
+                by_name[f"{kind}_{name}"] = getattr(self, kind)[:, number].numpy()
         for kind in _OF_DRIVERS:
-            found[kind] = getattr(self, kind).numpy()
+            by_name[kind] = getattr(self, kind).numpy()
         for kind, values in self.diagnostics.items():
-            found[kind] = values.numpy()
-        found["noise"] = np.full(len(self.low), self.noise.name, dtype=object)
+            by_name[kind] = values.numpy()
+        by_name["noise"] = np.full(len(self.low), self.noise.name, dtype=object)
         for kind, values in self.fan.check(self.seed).items():
-            found[kind] = values.numpy()
-        return found
+            by_name[kind] = values.numpy()
+        return by_name
 
     def tables(self, ids: Sequence[str]) -> dict[str, pd.DataFrame]:
         """Returns `posterior`, draws of each driver's parameters, `prior`, `fan` and `noise`.
@@ -196,21 +196,11 @@ class LaplaceMethod(PosteriorMethod):
         settings: CalibrationSettings,
     ) -> ParameterIntervals:
         with threads.one_thread():
-            return self._found(solver, batch, last, best, settings)
-
-    def _found(
-        self,
-        solver: Solver,
-        batch: PairBatch,
-        last: Tensor,
-        best: Tensor,
-        settings: CalibrationSettings,
-    ) -> ParameterIntervals:
-        noise = choose_noise(solver, batch, last, best, settings)
-        posterior = noise.posterior
-        origin = PriorDrivers(solver.space, posterior.prior)
-        found = self.draws_of(solver, posterior, _sampled(solver, posterior, noise.normal))
-        return _intervals(solver, batch, last, noise, (posterior, noise.normal.mode, origin, found))
+            noise = choose_noise(solver, batch, last, best, settings)
+            posterior, normal = noise.posterior, noise.normal
+            origin = PriorDrivers(solver.space, posterior.prior)
+            draws = self.draws_of(solver, posterior, _sampled(solver, posterior, normal))
+            return _intervals(solver, batch, last, noise, (posterior, normal.mode, origin, draws))
 
     def draws_of(self, solver: Solver, posterior: Posterior, sampled: Sampled) -> Sampled | Chains:
         """Returns the draws that stand for the posterior, of weighted samples of it."""
@@ -266,8 +256,9 @@ class SbiMethod(PosteriorMethod):
         noise = choose_noise(solver, batch, last, best, alone)
         posterior = noise.posterior
         origin = PriorDrivers(solver.space, posterior.prior)
-        found = learn(posterior, _shares(), seed=solver.seed, memory=solver.memory)
-        return _intervals(solver, batch, last, noise, (posterior, found.likeliest, origin, found))
+        learned = learn(posterior, _shares(), seed=solver.seed, memory=solver.memory)
+        places = (posterior, learned.likeliest, origin, learned)
+        return _intervals(solver, batch, last, noise, places)
 
 
 class HierarchicalMethod(PosteriorMethod):
@@ -345,15 +336,15 @@ def choose_noise(
         names = NOISE_KINDS
         if not isinstance(solver.stepper, MemoryStepper):
             names = ("trajectory",)
-    found: list[tuple[Posterior, Normal]] = []
+    candidates: list[tuple[Posterior, Normal]] = []
     evidence = {}
     for name in names:
         posterior = posterior_of(solver, batch, last, settings, name)
         normal = laplace(posterior, _starts(solver, posterior, best))
         evidence[name] = log_evidence(posterior, normal)
-        found.append((posterior, normal))
+        candidates.append((posterior, normal))
     totals = torch.stack(list(evidence.values())).sum(1)
-    posterior, normal = found[int(totals.argmax())]
+    posterior, normal = candidates[int(totals.argmax())]
     return ChosenNoise(posterior, normal, evidence)
 
 
@@ -363,10 +354,12 @@ def _starts(solver: Solver, posterior: Posterior, best: Tensor) -> Tensor:
     best = squashed(space.to_unit(best.to("cpu", torch.float64)))
     default = squashed(space.to_unit(space.defaults())).expand_as(best)
     likely = likely_starts(posterior, solver.seed)
-    known = torch.stack([best, default], dim=1)
+    starts = torch.stack([best, default], dim=1)
     # A gain that is estimated starts in the middle.
-    known = torch.cat([known, known.new_zeros((*known.shape[:2], posterior.kind.simulated))], -1)
-    return torch.cat([known, likely], dim=1)
+    starts = torch.cat(
+        [starts, starts.new_zeros((*starts.shape[:2], posterior.kind.simulated))], -1
+    )
+    return torch.cat([starts, likely], dim=1)
 
 
 def _shares() -> Tensor:
@@ -382,17 +375,17 @@ def _intervals(
     batch: PairBatch,
     last: Tensor,
     noise: ChosenNoise,
-    found: tuple[Posterior, Tensor, Population | PriorDrivers, Sampled | Chains | Learned],
+    posteriors: tuple[Posterior, Tensor, Population | PriorDrivers, Sampled | Chains | Learned],
 ) -> ParameterIntervals:
     """Returns the intervals of each driver's parameters.
 
     Args:
         solver, batch, last: as of `PosteriorMethod.find`.
         noise: that posteriors rest on.
-        found: the posteriors, their likeliest coordinates `(P, d)`, where new drivers come from,
-            and samples.
+        posteriors: the posteriors, their likeliest coordinates `(P, d)`, where new drivers come
+            from, and samples.
     """
-    posterior, likeliest, origin, sampled = found
+    posterior, likeliest, origin, sampled = posteriors
     space = solver.space
     shares = _shares()
     prior = posterior.prior.quantiles(shares, len(space))
@@ -473,13 +466,13 @@ def _of_noise(posterior: Posterior, likeliest: Tensor) -> dict[str, Tensor]:
     """Returns what coordinates `(P, d)` say of the noise, and what it leaves, `(P,)` each."""
     residual = posterior.residual(likeliest[:, None])[..., 0]
     left = (residual[1:] * residual[:-1]).sum(0) / residual.square().sum(0).clamp(min=1e-300)
-    own = likeliest[:, posterior.simulated :]
+    of_noise = likeliest[:, posterior.simulated :]
     gain = posterior.gain(likeliest[:, None])
     correlation = torch.zeros_like(left)
     if posterior.order:
-        correlation = own[:, 0].tanh()
+        correlation = of_noise[:, 0].tanh()
     return {
-        "noise_scale": own[:, -1].exp(),
+        "noise_scale": of_noise[:, -1].exp(),
         "noise_correlation": correlation,
         "noise_gain": torch.zeros_like(left) if gain is None else gain[:, 0],
         "noise_left": left,

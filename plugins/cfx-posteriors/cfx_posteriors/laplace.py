@@ -83,14 +83,14 @@ def laplace(posterior: Posterior, starts: Tensor) -> Normal:
     starts = torch.cat([starts, starts.new_zeros((*starts.shape[:-1], missing))], dim=-1)
     products = posterior.products(starts)
     place = torch.cat([starts, noise.first_noise(products, posterior.count)], dim=-1)
-    found, settled = _searched(posterior, place)
-    best = found.around.value.argmax(dim=1)
+    search, settled = _searched(posterior, place)
+    best = search.around.value.argmax(dim=1)
     rows = torch.arange(len(best), device=best.device)
-    factor = torch.linalg.cholesky(found.around.curvature[rows, best])
+    factor = torch.linalg.cholesky(search.around.curvature[rows, best])
     return Normal(
-        found.place[rows, best],
+        search.place[rows, best],
         torch.cholesky_inverse(factor),
-        found.around.value[rows, best],
+        search.around.value[rows, best],
         settled[rows, best],
     )
 
@@ -106,8 +106,8 @@ def log_evidence(posterior: Posterior, normal: Normal) -> Tensor:
     """
     size = torch.linalg.slogdet(normal.covariance).logabsdet
     volume = 0.5 * (size + posterior.dimensions * math.log(2.0 * math.pi))
-    found: Tensor = normal.log_density + volume + posterior.kind.log_constant
-    return found
+    evidence: Tensor = normal.log_density + volume + posterior.kind.log_constant
+    return evidence
 
 
 def curvature(posterior: Posterior, place: Tensor) -> Tensor:
@@ -153,8 +153,8 @@ def _searched(posterior: Posterior, place: Tensor) -> tuple[_Search, Tensor]:
     for _ in range(_ROUNDS):
         search, arrived = _round(part, search)
         whole.place[left] = search.place
-        for kept, own in zip(whole.around, search.around, strict=True):
-            kept[left] = own
+        for of_all, of_part in zip(whole.around, search.around, strict=True):
+            of_all[left] = of_part
         settled[left] |= arrived
         on = ~settled[left].all(dim=1)
         if not bool(on.any()):

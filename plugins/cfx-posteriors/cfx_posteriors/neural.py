@@ -156,8 +156,8 @@ class _Region(NamedTuple):
     def inner(self, places: Tensor) -> Tensor:
         """Returns the inverse of `outer`."""
         away = (places - self.middle).mT
-        found: Tensor = torch.linalg.solve_triangular(self.factor, away, upper=False).mT
-        return found
+        standard: Tensor = torch.linalg.solve_triangular(self.factor, away, upper=False).mT
+        return standard
 
 
 @dataclass(frozen=True)
@@ -187,28 +187,29 @@ class _Reader:
             errors: of these, `(K, P, q)`.
         """
         inputs = torch.cat([standard, torch.ones_like(standard[..., :1])], dim=-1)
-        found = torch.linalg.lstsq(inputs, errors.permute(1, 2, 0)).solution.permute(2, 0, 1)
+        solved = torch.linalg.lstsq(inputs, errors.permute(1, 2, 0)).solution.permute(2, 0, 1)
         scale = region.middle[:, 0, -1].exp()
-        return cls(posterior, found[..., -1], found[..., :-1], scale)
+        return cls(posterior, solved[..., -1], solved[..., :-1], scale)
 
     def __call__(self, errors: Tensor) -> Tensor:
         """Returns what is read of errors `(K, P, q)`, `(P, q, 3 n + 2 m + 1)`."""
         scored, order = self.posterior.scored, self.posterior.order
         away = (errors - self.mean[..., None]) * self.posterior.counted
         identity = torch.eye(self.slopes.shape[-1], dtype=away.dtype)
-        found = []
+        estimates = []  # of parameters, by weighted least squares for each correlation
         for correlation in away.new_tensor(_CORRELATIONS):
             slopes = noise.filtered(self.slopes, correlation[None]) * scored
             white = noise.filtered(away, correlation[None]) * scored
             slopes = slopes / self.scale[:, None]
             white = white / self.scale[:, None]
             precision = torch.einsum("kpi,kpj->pij", slopes, slopes) + identity
-            found.append(torch.linalg.solve(precision, torch.einsum("kpi,kpq->piq", slopes, white)))
-        left = away - torch.einsum("kpi,piq->kpq", self.slopes, found[0])
+            projected = torch.einsum("kpi,kpq->piq", slopes, white)
+            estimates.append(torch.linalg.solve(precision, projected))
+        left = away - torch.einsum("kpi,piq->kpq", self.slopes, estimates[0])
         products = noise.lagged_products(left, scored, order)
         lags = products[..., 0, 1:] / products[..., :1, 0].clamp(min=1e-12)
         about = noise.first_noise(products, self.posterior.count)
-        return torch.cat([*(one.mT for one in found), about, lags], dim=-1)
+        return torch.cat([*(estimate.mT for estimate in estimates), about, lags], dim=-1)
 
 
 class _Embedding(nn.Module):
@@ -222,9 +223,9 @@ class _Embedding(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         """Returns it, `(rows, _READ)`; x has the number of the driver, then what is read."""
-        own = self.own(x[:, 0].long())
-        found: Tensor = self.layers(torch.cat([x[:, 1:], own], dim=1))
-        return found
+        embedded = self.own(x[:, 0].long())
+        summary: Tensor = self.layers(torch.cat([x[:, 1:], embedded], dim=1))
+        return summary
 
 
 class _Silent:
@@ -266,9 +267,9 @@ class _Round:
     def log_density(self, places: Tensor) -> Tensor:
         """Returns the log of both densities' sum at places `(P, N, d)`, by share, `(P, N)`."""
         standard = self.region.inner(places)
-        found = self.flow.log_prob(standard.transpose(0, 1).float(), self.observed).T.double()
+        density = self.flow.log_prob(standard.transpose(0, 1).float(), self.observed).T.double()
         size = self.region.factor.diagonal(dim1=1, dim2=2).log().sum(-1)
-        of_flow = found - size[:, None] + math.log(_OF_FLOW / SAMPLES)
+        of_flow = density - size[:, None] + math.log(_OF_FLOW / SAMPLES)
         return torch.logaddexp(of_flow, self.region.tails.log_density(places))
 
     def coverage(self) -> float:
@@ -307,7 +308,7 @@ def _learned(posterior: Posterior, shares: Tensor, seed: int, memory: int) -> Le
         rounds.append(_learn_round(posterior, region, rounds, generator, memory))
         drawn = rounds[-1].draw(generator)
         height = _density(posterior, drawn, memory)
-        of_drawn = torch.stack([one.log_density(drawn) for one in rounds]).logsumexp(0)
+        of_drawn = torch.stack([trained.log_density(drawn) for trained in rounds]).logsumexp(0)
         if len(rounds) == 1:
             places, heights, mixture = drawn, height, of_drawn
         else:
@@ -322,15 +323,16 @@ def _learned(posterior: Posterior, shares: Tensor, seed: int, memory: int) -> Le
         region = _Region.of(places, log_weights)
 
     # The flow's own samples are of a prior that is its region.
-    own = drawn[:, :_OF_FLOW]
-    prior = posterior.prior.log_density(own[..., :n]) + noise.prior_log_density(own[..., n:])
-    inner = rounds[-1].region.inner(own)
+    from_flow = drawn[:, :_OF_FLOW]
+    prior = posterior.prior.log_density(from_flow[..., :n])
+    prior = prior + noise.prior_log_density(from_flow[..., n:])
+    inner = rounds[-1].region.inner(from_flow)
     of_flow = (prior + 0.5 * inner.square().sum(-1)).softmax(dim=1)
     trusted = (k <= MAX_PARETO_K)[:, None, None]
     weighted = weighted_quantiles(places[..., :n], smooth.exp(), shares)
-    alone = weighted_quantiles(own[..., :n], of_flow, shares)
+    alone = weighted_quantiles(from_flow[..., :n], of_flow, shares)
     draws = systematic(places, smooth.exp(), DRAWS, generator)
-    draws_alone = systematic(own, of_flow, DRAWS, generator)
+    draws_alone = systematic(from_flow, of_flow, DRAWS, generator)
     best = heights.argmax(dim=1)
     return Learned(
         torch.where(trusted, weighted, alone),
@@ -346,13 +348,13 @@ def _first_region(posterior: Posterior, seed: int, memory: int) -> _Region:
     """Returns what places all over the prior, with noise that fits each roughly, say."""
     drivers, n = posterior.segments.problems, len(posterior.space)
     logits = posterior.prior.draw(FIRST, n, seed=seed).expand(drivers, -1, -1)
-    found, densities = [], []
+    places, densities = [], []
     for part in torch.split(logits, _at_once(posterior, memory), dim=1):
         products = posterior.products(part)
         about = noise.first_noise(products, posterior.count)
-        found.append(torch.cat([part, about], dim=-1))
+        places.append(torch.cat([part, about], dim=-1))
         densities.append(noise.log_density(products, posterior.count, about))
-    return _Region.of(torch.cat(found, 1), torch.log_softmax(torch.cat(densities, 1), dim=1))
+    return _Region.of(torch.cat(places, 1), torch.log_softmax(torch.cat(densities, 1), dim=1))
 
 
 def _at_once(posterior: Posterior, memory: int) -> int:
@@ -452,9 +454,9 @@ def _recordings(
     errors = posterior.errors(region.outer(first)[..., :n]).nan_to_num().clamp(-1e3, 1e3)
     reader = _Reader.of(posterior, region, first[..., :n], errors)
     standard = standard.flatten(1, 2)
-    own = region.outer(standard)[..., n:]
-    noisy = white.transpose(0, 1) * own[..., -1].clamp(max=10.0).exp()
-    phi = noise.coefficients(own[..., :-1])
+    of_noise = region.outer(standard)[..., n:]
+    noisy = white.transpose(0, 1) * of_noise[..., -1].clamp(max=10.0).exp()
+    phi = noise.coefficients(of_noise[..., :-1])
     for step in range(1, steps):
         for back in range(min(step, order)):
             noisy[step] += phi[..., back] * noisy[step - 1 - back]

@@ -141,10 +141,10 @@ def filtered(values: Tensor, phi: Tensor) -> Tensor:
         values: `(K, *batch)`.
         phi: coefficients, `(*batch, m)`.
     """
-    found = values.clone()
+    innovations = values.clone()
     for k in range(phi.shape[-1]):
-        found[k + 1 :] -= phi[..., k] * values[: -k - 1]
-    return found
+        innovations[k + 1 :] -= phi[..., k] * values[: -k - 1]
+    return innovations
 
 
 def prior_log_density(noise: Tensor) -> Tensor:
@@ -154,16 +154,16 @@ def prior_log_density(noise: Tensor) -> Tensor:
     """
     log_scale = noise[..., -1]
     uniform = uniform_log_density(noise[..., :-1])
-    found: Tensor = uniform - 2.0 * SHAPE * log_scale - RATE * torch.exp(-2.0 * log_scale)
-    return found
+    density: Tensor = uniform - 2.0 * SHAPE * log_scale - RATE * torch.exp(-2.0 * log_scale)
+    return density
 
 
 def uniform_log_density(squashed: Tensor) -> Tensor:
     """Returns the log density of squashed partial autocorrelations `(*batch, m)` a priori."""
     # log(1 - tanh(x)^2) without cancellation.
     size = squashed.abs()
-    found: Tensor = 2.0 * (math.log(2.0) - size - softplus(-2.0 * size)).sum(-1)
-    return found
+    density: Tensor = 2.0 * (math.log(2.0) - size - softplus(-2.0 * size)).sum(-1)
+    return density
 
 
 def draw(count: int, order: int, generator: torch.Generator) -> Tensor:

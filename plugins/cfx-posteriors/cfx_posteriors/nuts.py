@@ -139,13 +139,16 @@ class _Coordinates:
         shares = torch.tensor(_SHARES, dtype=torch.float64)
         inside = torch.special.ndtri(shares)
         deviation = sampled.std(dim=1).clamp(min=1e-9)
-        known = sampled.quantile(shares, dim=1)
+        quantiles = sampled.quantile(shares, dim=1)
         # Samples may be the same, and a coordinate has to rise all the same.
-        known = known + _LEAST_RISE * inside[:, None, None] * deviation
-        low = (known[1] - known[0]) / (inside[1] - inside[0])
-        high = (known[-1] - known[-2]) / (inside[-1] - inside[-2])
-        far = [known[0] - (_FAR + inside[0]) * low], [known[-1] + (_FAR - inside[-1]) * high]
-        places = torch.stack([*far[0], *known, *far[1]])
+        quantiles = quantiles + _LEAST_RISE * inside[:, None, None] * deviation
+        low = (quantiles[1] - quantiles[0]) / (inside[1] - inside[0])
+        high = (quantiles[-1] - quantiles[-2]) / (inside[-1] - inside[-2])
+        far = (
+            [quantiles[0] - (_FAR + inside[0]) * low],
+            [quantiles[-1] + (_FAR - inside[-1]) * high],
+        )
+        places = torch.stack([*far[0], *quantiles, *far[1]])
         self.knots = torch.cat([inside.new_tensor([-_FAR]), inside, inside.new_tensor([_FAR])])
         cubic = PchipInterpolator(self.knots.numpy(), places.numpy())
         self.cubic = torch.from_numpy(cubic.c).permute(2, 0, 3, 1)
@@ -273,9 +276,9 @@ def effective_samples(chains: NDArray[np.float64]) -> NDArray[np.float64]:
     Args:
         chains: `(P, C, draws, d)`.
     """
-    found = array_stats.ess(chains, chain_axis=1, draw_axis=2)
+    bulk = array_stats.ess(chains, chain_axis=1, draw_axis=2)
     tails = array_stats.ess(chains, chain_axis=1, draw_axis=2, method="tail", prob=(0.05, 0.95))
-    least: NDArray[np.float64] = np.minimum(found, tails).min(-1)
+    least: NDArray[np.float64] = np.minimum(bulk, tails).min(-1)
     return least
 
 
@@ -296,7 +299,7 @@ def _walked(posterior: Posterior, sampled: Tensor, seed: int) -> tuple[Tensor, T
     half, learning, every = (
         draws // _AT_ONCE for draws in (WARM_UP // 2, WARM_UP, WARM_UP + DRAWS)
     )
-    found: list[_Step] = []
+    steps_of_parts: list[_Step] = []
     with jax.enable_x64(True), jax.default_device(jax.devices("cpu")[0]):
         begin, go_on = _sampler(density)
         now = begin(starts)
@@ -304,19 +307,19 @@ def _walked(posterior: Posterior, sampled: Tensor, seed: int) -> tuple[Tensor, T
         with Task(title, every * _AT_ONCE) as task:
             for number in range(every):
                 if number == half:
-                    seen = torch.tensor(found[-1].place).flatten(1, 2)
+                    seen = torch.tensor(steps_of_parts[-1].place).flatten(1, 2)
                     density.change(density.coordinates.relearned(sampled, seen))
                     now = begin(starts)
                 folded = jax.random.fold_in(key, number)
                 keys = jax.random.split(folded, (shape[0], _AT_ONCE, CHAINS))
                 now, steps = go_on(keys, now, number < learning)
-                found.append(_Step(*map(np.asarray, steps)))
+                steps_of_parts.append(_Step(*map(np.asarray, steps)))
                 task.advance(_AT_ONCE)
     coordinates = density.coordinates
     # Draws come before chains.
     places, diverges = (
         torch.from_numpy(np.concatenate(values, axis=1)).transpose(1, 2)
-        for values in zip(*found[learning:], strict=True)
+        for values in zip(*steps_of_parts[learning:], strict=True)
     )
     outer, *_ = coordinates.outer(places.flatten(1, 2))
     drawn = []
@@ -346,8 +349,8 @@ def _sampler(density: _Density) -> tuple[Callable[..., _Walk], Callable[..., tup
         identity = jnp.eye(walk.state.position.shape[-1])
 
         def step(walk: _Walk, keys: jax.Array) -> tuple[_Walk, _Step]:
-            known = walk.length
-            length = jnp.exp(jnp.where(learning, known.log_step_size, known.log_step_size_avg))
+            adapted = walk.length
+            length = jnp.exp(jnp.where(learning, adapted.log_step_size, adapted.log_step_size_avg))
 
             def of_chain(key: jax.Array, state: HMCState) -> tuple[HMCState, NUTSInfo]:
                 drawn: tuple[HMCState, NUTSInfo] = kernel(
@@ -356,12 +359,12 @@ def _sampler(density: _Density) -> tuple[Callable[..., _Walk], Callable[..., tup
                 return drawn
 
             state, said = jax.vmap(of_chain)(keys, walk.state)
-            more = learned(known, said.acceptance_rate.mean())
-            kept = jax.tree.map(lambda new, old: jnp.where(learning, new, old), more, known)
+            more = learned(adapted, said.acceptance_rate.mean())
+            kept = jax.tree.map(lambda new, old: jnp.where(learning, new, old), more, adapted)
             return _Walk(state, kept), _Step(state.position, said.is_divergent)
 
-        found: tuple[_Walk, _Step] = jax.lax.scan(step, walk, keys)
-        return found
+        walked: tuple[_Walk, _Step] = jax.lax.scan(step, walk, keys)
+        return walked
 
     compiled = functools.partial(jax.jit, compiler_options=_QUICKLY)
     return compiled(jax.vmap(begin)), compiled(jax.vmap(go_on, in_axes=(0, 0, None)))

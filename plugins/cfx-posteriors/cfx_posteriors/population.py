@@ -109,9 +109,9 @@ def _expected(
     """
     drivers = len(logits)
     for _ in range(_STEPS):
-        own = population.prior.log_density(logits)
+        density = population.prior.log_density(logits)
         size = torch.linalg.slogdet(population.covariance).logabsdet
-        weights = (own - 0.5 * size - before).softmax(dim=1)[..., None]
+        weights = (density - 0.5 * size - before).softmax(dim=1)[..., None]
         places = (weights * logits).sum((0, 1))
         mean = (places + PSEUDO * pseudo.mean) / (drivers + PSEUDO)
         away = logits - mean

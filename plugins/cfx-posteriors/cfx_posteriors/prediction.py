@@ -66,14 +66,15 @@ class Predictor:
             return self._rear - self._follower.position, self._gap
         return self._follower.speed, self._speed
 
-    def correct(self, error: Tensor, known: Tensor) -> None:
-        """Moves position and speed towards what was measured after the step, or is drawn.
+    def correct(self, error: Tensor, is_measured: Tensor) -> None:
+        """Moves position and speed towards the signal after the step.
 
         Args:
-            error: predicted minus measured signal, `(P, q)`.
-            known: where it is measured, bool, broadcasting to `(P, q)`. Elsewhere it is drawn, and
-                stands for an acceleration that was constant within the step: one that has changed
-                the speed by e has moved the position by e / 2 times the step's duration.
+            error: predicted minus true signal, `(P, q)`.
+            is_measured: whether the true signal was measured, bool, broadcasting to `(P, q)`. If
+                not, the error is drawn from the noise. It then stands for an acceleration that was
+                constant within the step: one that changes the speed by e moves the position by
+                e / 2 times the step's duration.
         """
         if self._gain is None:
             return
@@ -82,8 +83,10 @@ class Predictor:
         of_speed, of_position = error, half * error
         if self._signal == "gap":
             of_speed, of_position = -error / half, -error
-        of_speed = torch.where(known, follower.speed - self._speed, of_speed)
-        of_position = torch.where(known, follower.position - (self._rear - self._gap), of_position)
+        of_speed = torch.where(is_measured, follower.speed - self._speed, of_speed)
+        of_position = torch.where(
+            is_measured, follower.position - (self._rear - self._gap), of_position
+        )
         share = noise.gain_after(self._gain, self._steps)
         self._follower = follower._replace(
             position=follower.position - share * of_position,

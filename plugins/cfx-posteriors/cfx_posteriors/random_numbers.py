@@ -33,7 +33,7 @@ class DrawsFrom(TorchDispatchMode):  # type: ignore[no-untyped-call] # PyTorch's
         given, values = dict(kwargs or {}), list(args)
         operation = _with_generator(func)
         if operation is not None:
-            names = [one.name for one in operation._schema.arguments]  # noqa: SLF001 - as below
+            names = [argument.name for argument in operation._schema.arguments]  # noqa: SLF001 - as below
             place = names.index("generator")
             if place < len(values):
                 values[place] = values[place] or self._generator
@@ -47,7 +47,7 @@ def _with_generator(operation: Any) -> Any:
     if torch.Tag.nondeterministic_seeded not in operation.tags:
         return None
     # PyTorch's own modes look at these; there is no public name.
-    if any(one.name == "generator" for one in operation._schema.arguments):  # noqa: SLF001
+    if any(argument.name == "generator" for argument in operation._schema.arguments):  # noqa: SLF001
         return operation
     name = operation._overloadname  # noqa: SLF001
     wanted = "generator" if name == "default" else f"{name}_generator"

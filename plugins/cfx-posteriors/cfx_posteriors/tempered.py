@@ -145,39 +145,42 @@ def _moved(posterior: Posterior, crowd: _Crowd, moves: int, generator: torch.Gen
             continue
         scale = 1.0 if number % 4 == 3 else 2.38 / math.sqrt(2 * d)
         # Differences are of the other half, so that they do not depend on who moves.
-        for own, others in ((everybody[::2], everybody[1::2]), (everybody[1::2], everybody[::2])):
-            one, other = (
+        for moving, others in (
+            (everybody[::2], everybody[1::2]),
+            (everybody[1::2], everybody[::2]),
+        ):
+            place, other = (
                 crowd.places[:, others[torch.randperm(len(others), generator=generator)]]
                 for _ in range(2)
             )
-            normal = torch.randn((len(own), d), generator=generator, dtype=away.dtype)
-            shift = scale * (one - other) + _NEAR * normal
-            crowd, _ = _metropolis(posterior, crowd, own, shift, generator)
+            normal = torch.randn((len(moving), d), generator=generator, dtype=away.dtype)
+            shift = scale * (place - other) + _NEAR * normal
+            crowd, _ = _metropolis(posterior, crowd, moving, shift, generator)
     return crowd
 
 
 def _metropolis(
-    posterior: Posterior, crowd: _Crowd, own: Tensor, shift: Tensor, generator: torch.Generator
+    posterior: Posterior, crowd: _Crowd, moving: Tensor, shift: Tensor, generator: torch.Generator
 ) -> tuple[_Crowd, Tensor]:
     """Returns the crowd after one step of some samples, and how many accept it, `(P,)`.
 
     Args:
         posterior: of P drivers.
         crowd: all samples.
-        own: numbers of those M that move.
+        moving: numbers of those M that move.
         shift: of theirs, `(P, M, d)`.
         generator: of random numbers.
     """
-    places, prior, likelihood = (values[:, own] for values in crowd[:3])
+    places, prior, likelihood = (values[:, moving] for values in crowd[:3])
     tried = places + shift
     new_prior, new_likelihood = _density(posterior, tried)
     rise = new_prior - prior + crowd.power[:, None] * (new_likelihood - likelihood)
-    chance = torch.rand(len(own), generator=generator, dtype=rise.dtype).log()
+    chance = torch.rand(len(moving), generator=generator, dtype=rise.dtype).log()
     goes = chance < rise
     return crowd._replace(
-        places=crowd.places.index_copy(1, own, torch.where(goes[..., None], tried, places)),
-        prior=crowd.prior.index_copy(1, own, torch.where(goes, new_prior, prior)),
+        places=crowd.places.index_copy(1, moving, torch.where(goes[..., None], tried, places)),
+        prior=crowd.prior.index_copy(1, moving, torch.where(goes, new_prior, prior)),
         likelihood=crowd.likelihood.index_copy(
-            1, own, torch.where(goes, new_likelihood, likelihood)
+            1, moving, torch.where(goes, new_likelihood, likelihood)
         ),
     ), goes.double().mean(1)

@@ -143,18 +143,18 @@ class Service:
             "$limit": str(query.page_rows),
             "$offset": str(offset),
         }
-        found = 0
+        received = 0
         for _ in range(_TRIES):
             text = self._get(asked)
             table = _table(text)
             if not _has_columns(table, query.columns):
                 raise self._nonsense("the data set's columns", table)
-            found = len(table) - 1
-            if found == rows and all(len(row) == len(query.columns) for row in table):
+            received = len(table) - 1
+            if received == rows and all(len(row) == len(query.columns) for row in table):
                 return text
         raise DataError(
-            f"{self.name} sent {found} instead of {rows} rows from row {offset} on, {_TRIES} times;"
-            f" run the same command later: the pages in {self._kept} are kept"
+            f"{self.name} sent {received} instead of {rows} rows from row {offset} on, {_TRIES}"
+            f" times; run the same command later: the pages in {self._kept} are kept"
         )
 
     def close(self) -> None:
@@ -396,8 +396,8 @@ def _table(text: str) -> list[list[str]]:
 def _has_columns(table: Sequence[Sequence[str]], columns: Sequence[str]) -> bool:
     if not table:
         return False
-    found = [name.strip().lower() for name in table[0]]
-    return found == [name.lower() for name in columns]
+    names = [name.strip().lower() for name in table[0]]
+    return names == [name.lower() for name in columns]
 
 
 def _session(wait_s: float) -> Session:

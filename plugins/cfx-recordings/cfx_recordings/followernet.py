@@ -183,9 +183,9 @@ def _events(path: Path) -> Iterator[Floats]:
                 " (events, 4, samples), or (4, samples)"
             )
         for event in values:
-            known = np.flatnonzero(np.isfinite(event).any(axis=0))
-            if len(known):
-                yield event[:, : known[-1] + 1]
+            recorded = np.flatnonzero(np.isfinite(event).any(axis=0))
+            if len(recorded):
+                yield event[:, : recorded[-1] + 1]
 
 
 def _arrays(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
@@ -226,10 +226,10 @@ def _matlab(path: Path) -> Iterator[tuple[str, NDArray[Any]]]:
     from scipy.io.matlab import MatReadError
 
     try:
-        found = loadmat(path)
+        arrays = loadmat(path)
     except (MatReadError, NotImplementedError, TypeError) as error:
         raise DataError(f"{path}: cannot be read as a MATLAB file ({error})") from None
-    for name, array in found.items():
+    for name, array in arrays.items():
         if name.startswith("__"):
             continue
         if array.dtype == object:

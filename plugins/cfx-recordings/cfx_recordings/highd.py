@@ -225,8 +225,8 @@ def _beside(path: Path, ending: str) -> Path:
     Raises:
         DataError: the tracks are not named as highD's, or there is no such file.
     """
-    number, found, packing = path.name.partition(_TRACKS)
-    if not found or packing not in _PACKINGS:
+    number, separator, packing = path.name.partition(_TRACKS)
+    if not separator or packing not in _PACKINGS:
         raise DataError(
             f"{path}: highD's tracks are named XX{_TRACKS}; give this file, with"
             f" XX{_TRACKS_META} and XX{_RECORDING_META} beside it"

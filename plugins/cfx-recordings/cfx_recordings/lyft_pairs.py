@@ -190,7 +190,7 @@ def _pairs(store: _Store) -> PairSet:
         signals = {name: values[run] for name, values in store.signals.items()}
         for who, sizes in store.sizes.items():
             signals[f"{who}_position"] = signals[f"{who}_position"] + sizes[number] / 2
-        one = Series(
+        pair = Series(
             name=f"{recording}-{number}",
             recording=recording,
             leader_id=f"leader-{number}",
@@ -202,5 +202,5 @@ def _pairs(store: _Store) -> PairSet:
             driver_types=(types[0],),
             leader_driver_type=types[1],
         )
-        series.append(one)
+        series.append(pair)
     return pairs_of(series, str(store.path))

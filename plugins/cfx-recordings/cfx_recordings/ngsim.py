@@ -583,7 +583,7 @@ def _with_different_names(parts: Sequence[Rows]) -> list[Rows]:
     files: dict[str, str] = {}
     result = []
     for rows in parts:
-        own = []
+        names = []
         for recording in rows.recordings:
             name = _name_in(rows, recording, is_shared=counts[recording] > 1)
             if name in files:
@@ -591,9 +591,9 @@ def _with_different_names(parts: Sequence[Rows]) -> list[Rows]:
                     f"{files[name]} and {rows.source}: both recordings would be called '{name}';"
                     " rename one of the files"
                 )
-            own.append(name)
-        files |= dict.fromkeys(own, rows.source)
-        result.append(replace(rows, recordings=tuple(own)))
+            names.append(name)
+        files |= dict.fromkeys(names, rows.source)
+        result.append(replace(rows, recordings=tuple(names)))
     return result
 
 

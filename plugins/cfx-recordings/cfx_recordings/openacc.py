@@ -159,11 +159,11 @@ def _read(path: Path) -> _File:
 
 def _by_place(columns: Mapping[str, _Column], kind: str) -> dict[int, _Column]:
     """Returns the columns of a kind, such as Speed1 and Speed2, by the vehicle's place."""
-    found = {}
+    by_place = {}
     for name, values in columns.items():
         if name.startswith(kind):
-            found[int(name.removeprefix(kind))] = values
-    return found
+            by_place[int(name.removeprefix(kind))] = values
+    return by_place
 
 
 def _check_time(table: Table) -> None:
@@ -195,7 +195,7 @@ def _series(file: _File, ahead: int, behind: int) -> Series:
     leader, follower = _name(file, ahead), _name(file, behind)
     codes, types = _driver(file, behind)
     _, leader_types = _driver(file, ahead)
-    known = [one for one in leader_types if one]
+    stated = [driver_type for driver_type in leader_types if driver_type]
     return Series(
         name=f"{stem(file.path)}-{follower}-{leader}",
         recording=stem(file.path),
@@ -207,7 +207,7 @@ def _series(file: _File, ahead: int, behind: int) -> Series:
         gap=file.gaps[ahead],
         labels={"driver_type": codes},
         driver_types=types,
-        leader_driver_type=known[0] if len(known) == 1 else "",
+        leader_driver_type=stated[0] if len(stated) == 1 else "",
         site=file.path.absolute().parent.name,
         vehicle=_car(file, behind),
     )

@@ -70,18 +70,18 @@ def pairs_of(
     lost = list(dropped)
     ends: list[Dropped] = []
     seen: dict[str, int] = {}
-    for one in series:
-        reasons = _left_out(one, max_gap)
+    for source_pair in series:
+        reasons = _left_out(source_pair, max_gap)
         is_good = ~np.any(list(reasons.values()), axis=0)
         good = np.flatnonzero(is_good)
-        labels = [values[good] for values in one.labels.values()]
-        starts, sizes = tracks.runs(one.frame[good] - np.arange(len(good)), *labels)
+        labels = [values[good] for values in source_pair.labels.values()]
+        starts, sizes = tracks.runs(source_pair.frame[good] - np.arange(len(good)), *labels)
         is_pair = sizes > 1
         lost += tracks.count_reasons({**reasons, tracks.SINGLE_FRAME: sizes < 2}, "rows")
         stops = starts + sizes
-        ends += tracks.count_reasons(_ends(one, reasons, good[stops[is_pair] - 1]), "pairs")
+        ends += tracks.count_reasons(_ends(source_pair, reasons, good[stops[is_pair] - 1]), "pairs")
         for start, stop in zip(starts[is_pair].tolist(), stops[is_pair].tolist(), strict=True):
-            pairs.append(_pair(one, slice(good[start], good[stop - 1] + 1), seen))
+            pairs.append(_pair(source_pair, slice(good[start], good[stop - 1] + 1), seen))
     return PairSet(
         tuple(pairs),
         source,
@@ -91,16 +91,16 @@ def pairs_of(
     )
 
 
-def _left_out(one: Series, max_gap: float | None) -> dict[str, tracks.Marks]:
+def _left_out(source_pair: Series, max_gap: float | None) -> dict[str, tracks.Marks]:
     """Returns the frames that belong to no pair, by the first reason that holds."""
-    values = list(one.signals.values())
-    if one.gap is None:
-        signals = one.signals
-        gap = signals["leader_position"] - one.leader_length - signals["follower_position"]
+    values = list(source_pair.signals.values())
+    if source_pair.gap is None:
+        signals = source_pair.signals
+        gap = signals["leader_position"] - source_pair.leader_length - signals["follower_position"]
     else:
-        gap = one.gap
+        gap = source_pair.gap
         values.append(gap)
-    slowest = np.minimum(one.signals["leader_speed"], one.signals["follower_speed"])
+    slowest = np.minimum(source_pair.signals["leader_speed"], source_pair.signals["follower_speed"])
     furthest = np.inf
     if max_gap is not None:
         furthest = max_gap
@@ -113,55 +113,64 @@ def _left_out(one: Series, max_gap: float | None) -> dict[str, tracks.Marks]:
     return tracks.first_that_holds(reasons)
 
 
-def _ends(one: Series, reasons: Mapping[str, tracks.Marks], last: Ints) -> dict[str, tracks.Marks]:
+def _ends(
+    source_pair: Series, reasons: Mapping[str, tracks.Marks], last: Ints
+) -> dict[str, tracks.Marks]:
     """Returns why each pair ends, by reason.
 
     Args:
         last: index of each pair's last frame.
     """
-    after = np.minimum(last + 1, len(one.frame) - 1)
-    found: dict[str, tracks.Marks] = {"the source's pair ends": last + 1 == len(one.frame)}
-    found["frames are missing"] = one.frame[after] != one.frame[last] + 1
+    after = np.minimum(last + 1, len(source_pair.frame) - 1)
+    reasons_of_end: dict[str, tracks.Marks] = {
+        "the source's pair ends": last + 1 == len(source_pair.frame)
+    }
+    reasons_of_end["frames are missing"] = source_pair.frame[after] != source_pair.frame[last] + 1
     for reason, holds in reasons.items():
-        found[reason] = holds[after]
-    for label, values in one.labels.items():
-        found[f"the {label.replace('_', ' ')} changes"] = values[after] != values[last]
-    return tracks.first_that_holds(found)
+        reasons_of_end[reason] = holds[after]
+    for label, values in source_pair.labels.items():
+        reasons_of_end[f"the {label.replace('_', ' ')} changes"] = values[after] != values[last]
+    return tracks.first_that_holds(reasons_of_end)
 
 
-def _pair(one: Series, run: slice, seen: dict[str, int]) -> Pair:
+def _pair(source_pair: Series, run: slice, runs: dict[str, int]) -> Pair:
     """Returns the pair of a stretch of good frames."""
     signals: dict[str, Any] = {}
-    for name, values in one.signals.items():
+    for name, values in source_pair.signals.items():
         signals[name] = values[run]
-    if one.gap is not None:
+    if source_pair.gap is not None:
         leader = signals.get("leader_position")
         if leader is None:
-            leader = tracks.distance_driven(signals["leader_speed"], one.dt) + one.leader_length
+            leader = (
+                tracks.distance_driven(signals["leader_speed"], source_pair.dt)
+                + source_pair.leader_length
+            )
         signals["leader_position"] = leader
-        signals["follower_position"] = leader - one.leader_length - one.gap[run]
+        signals["follower_position"] = leader - source_pair.leader_length - source_pair.gap[run]
     for who in ("leader", "follower"):
         if f"{who}_acceleration" not in signals:
-            signals[f"{who}_acceleration"] = tracks.accelerations(signals[f"{who}_speed"], one.dt)
+            signals[f"{who}_acceleration"] = tracks.accelerations(
+                signals[f"{who}_speed"], source_pair.dt
+            )
     kind = 0
-    if "driver_type" in one.labels:
-        kind = int(one.labels["driver_type"][run.start])
+    if "driver_type" in source_pair.labels:
+        kind = int(source_pair.labels["driver_type"][run.start])
     lane = None
-    if "lane" in one.labels:
-        lane = int(one.labels["lane"][run.start])
+    if "lane" in source_pair.labels:
+        lane = int(source_pair.labels["lane"][run.start])
     return Pair(
-        pair_id=tracks.unique_name(one.name, seen),
-        recording=one.recording,
-        leader_id=one.leader_id,
-        follower_id=one.follower_id,
-        first_frame=int(one.frame[run.start]),
-        dt=one.dt,
-        leader_length=one.leader_length,
+        pair_id=tracks.unique_name(source_pair.name, runs),
+        recording=source_pair.recording,
+        leader_id=source_pair.leader_id,
+        follower_id=source_pair.follower_id,
+        first_frame=int(source_pair.frame[run.start]),
+        dt=source_pair.dt,
+        leader_length=source_pair.leader_length,
         lane=lane,
-        driver_type=one.driver_types[kind],
-        leader_driver_type=one.leader_driver_type,
-        site=one.site,
-        vehicle=one.vehicle,
+        driver_type=source_pair.driver_types[kind],
+        leader_driver_type=source_pair.leader_driver_type,
+        site=source_pair.site,
+        vehicle=source_pair.vehicle,
         **signals,
     )
 

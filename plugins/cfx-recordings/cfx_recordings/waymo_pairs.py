@@ -112,11 +112,11 @@ def _pairs(file: Table) -> PairSet:
     series = []
     alone = 0
     for rows in np.split(order, starts[1:]):
-        one = _series(file, {name: values[rows] for name, values in numbers.items()})
-        if one is None:
+        pair = _series(file, {name: values[rows] for name, values in numbers.items()})
+        if pair is None:
             alone += len(rows)
         else:
-            series.append(one)
+            series.append(pair)
     dropped = []
     if alone:
         dropped.append(

@@ -84,19 +84,23 @@ def report(
 
     if group_by is not None and tables is None:
         raise ConfigError(f"--group-by {group_by} goes with --tables latex or --tables csv")
-    found = read_runs(runs)
+    jobs_of_runs = read_runs(runs)
     folder = Path(runs[0]).expanduser()
     home = folder if len(runs) == 1 and folder.is_dir() else Path()
     kind = "Report"
     if tables is None:
-        path = write_report(found, Path(output).expanduser() if output else home / NAME, title)
+        path = write_report(
+            jobs_of_runs, Path(output).expanduser() if output else home / NAME, title
+        )
     else:
         kind, name = "Table", Path(NAME).with_suffix(FORMS[tables])
         file = Path(output).expanduser() if output else home / name
-        path = write_table(found, file, tables, group_by)
+        path = write_table(jobs_of_runs, file, tables, group_by)
     left_out = ""
-    if found.unfinished and tables is None:
-        left_out = f"; {len(found.unfinished)} unfinished ones are named in it"
-    elif found.unfinished:
-        left_out = f"; {len(found.unfinished)} unfinished ones are not in it"
-    return [f"{kind} of {wording.plural(len(found.jobs), 'job')}{left_out}: {path.absolute()}"]
+    if jobs_of_runs.unfinished and tables is None:
+        left_out = f"; {len(jobs_of_runs.unfinished)} unfinished ones are named in it"
+    elif jobs_of_runs.unfinished:
+        left_out = f"; {len(jobs_of_runs.unfinished)} unfinished ones are not in it"
+    return [
+        f"{kind} of {wording.plural(len(jobs_of_runs.jobs), 'job')}{left_out}: {path.absolute()}"
+    ]

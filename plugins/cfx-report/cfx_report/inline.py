@@ -57,13 +57,13 @@ def inline_svg(figure: Figure) -> str:
     text = re.sub(r' d="[^"]*"', _shorter, text)
     used = set(re.findall(r"(?:href=\"|url\()#([^\")]+)", text))
     hovered = re.compile(r'<g id="hover-(\d+)">')
-    text = hovered.sub(lambda found: f"<g><title>{hovers[int(found[1])]}</title>", text)
+    text = hovered.sub(lambda match: f"<g><title>{hovers[int(match[1])]}</title>", text)
     text = re.sub(
         r' id="([^"]*)"',
-        lambda found: f' id="{PLACE}{found[1]}"' if found[1] in used else "",
+        lambda match: f' id="{PLACE}{match[1]}"' if match[1] in used else "",
         text,
     )
-    text = re.sub(r"(href=\"|url\()#", lambda found: f"{found[1]}#{PLACE}", text)
+    text = re.sub(r"(href=\"|url\()#", lambda match: f"{match[1]}#{PLACE}", text)
     # As wide as its paper, beside others that take the page's whole width.
     wide = f"max-width: {100 * figure.get_size_inches()[0] / canvas.WIDTH:.0f}%"
     head = rf'<svg \1 aria-hidden="true" style="{wide}">'
@@ -92,9 +92,9 @@ def _prepare(figure: Figure) -> list[str]:
     return hovers
 
 
-def _shorter(found: re.Match[str]) -> str:
+def _shorter(match: re.Match[str]) -> str:
     """Returns the path of an SVG with hundredths of a point."""
-    return re.sub(r"(\.\d\d)\d+", r"\1", found[0])
+    return re.sub(r"(\.\d\d)\d+", r"\1", match[0])
 
 
 def embedded_json(value: object) -> str:

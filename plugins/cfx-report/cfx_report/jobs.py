@@ -36,10 +36,10 @@ def are_calibrations(jobs: Iterable[Result]) -> bool:
 
 def any_baselines(jobs: Iterable[Result], scope: str = wording.TEST) -> list[str]:
     """Returns what the policy of any of the jobs is compared with, in the order of the jobs."""
-    found: dict[str, None] = {}
+    baselines: dict[str, None] = {}
     for job in jobs:
-        found |= dict.fromkeys(job.baselines(scope))
-    return list(found)
+        baselines |= dict.fromkeys(job.baselines(scope))
+    return list(baselines)
 
 
 def any_has_metric(

@@ -67,15 +67,15 @@ def _telling(columns: Sequence[list[str]]) -> list[list[str]]:
     """Returns the first column, and as few others as tell apart what all columns tell apart."""
     left, kept = list(range(1, len(columns))), [0]
     while left and _kinds(columns, kept) < _kinds(columns, range(len(columns))):
-        best = max(left, key=lambda one: _kinds(columns, [*kept, one]))
+        best = max(left, key=lambda column: _kinds(columns, [*kept, column]))
         left.remove(best)
         kept.append(best)
-    return [columns[one] for one in sorted(kept)]
+    return [columns[column] for column in sorted(kept)]
 
 
 def _kinds(columns: Sequence[Sequence[str]], chosen: Sequence[int]) -> int:
     """Returns how many jobs some columns tell apart."""
-    return len(set(zip(*(columns[one] for one in chosen), strict=True)))
+    return len(set(zip(*(columns[column] for column in chosen), strict=True)))
 
 
 def differences(jobs: Sequence[Result], ignored: Sequence[str] = ()) -> list[list[str]]:
@@ -114,16 +114,16 @@ def _columns(jobs: Sequence[Result], ignored: Sequence[str]) -> list[list[str]]:
 def _differs(key: str, jobs: Sequence[Result], flat: Sequence[Mapping[str, Any]]) -> bool:
     """Says whether a setting differs between jobs that share the component it belongs to."""
     group = key.partition(".")[0]
-    found: dict[str, set[Any]] = {}
+    by_peer: dict[str, set[Any]] = {}
     for job, values in zip(jobs, flat, strict=True):
         peer = job.component(group) if group in GROUPS else ""
-        found.setdefault(peer, set()).add(values.get(key, ""))
-    return any(len(values) > 1 for values in found.values())
+        by_peer.setdefault(peer, set()).add(values.get(key, ""))
+    return any(len(values) > 1 for values in by_peer.values())
 
 
 def _said(key: str, flat: Sequence[Mapping[str, Any]]) -> list[str]:
     """Returns a setting of each job in words; long values without what they all begin with."""
-    values = [str(one[key]) if key in one else "" for one in flat]
+    values = [str(settings[key]) if key in settings else "" for settings in flat]
     longest = max(map(len, values))
     same = wording.common_prefix([value for value in values if value])
     said = []
@@ -180,11 +180,11 @@ def rows_of(jobs: Sequence[Result], group_by: str | None = None) -> tuple[Row, .
             " instance seed or data.max_pairs"
         )
     names = shortest_names(jobs, ignored)
-    found: dict[str, list[Result]] = {}
+    by_name: dict[str, list[Result]] = {}
     for number, (name, job) in enumerate(zip(names, jobs, strict=True)):
         key = name if group_by is not None or names.count(name) == 1 else f"{name} ({number + 1})"
-        found.setdefault(key, []).append(job)
-    return tuple(Row(name, tuple(alike)) for name, alike in found.items())
+        by_name.setdefault(key, []).append(job)
+    return tuple(Row(name, tuple(alike)) for name, alike in by_name.items())
 
 
 def rows_over_seeds(jobs: Sequence[Result]) -> tuple[Row, ...]:
@@ -201,14 +201,14 @@ def comparison_of(jobs: Sequence[Result]) -> comparison.Comparison:
 
 def methods_of(rows: Sequence[Row]) -> list[str]:
     """Returns the methods that any job measured; a calibration's policy is no method of its own."""
-    found: dict[str, None] = {}
+    methods: dict[str, None] = {}
     for row in rows:
         for job in row.jobs:
-            found |= dict.fromkeys(job.shown_methods)
-    found.pop("policy", None)
+            methods |= dict.fromkeys(job.shown_methods)
+    methods.pop("policy", None)
     if any_adapts(rows):
-        return [*found, "policy"]
-    return [method for method in found if method != "driver_specific"] + ["driver_specific"]
+        return [*methods, "policy"]
+    return [method for method in methods if method != "driver_specific"] + ["driver_specific"]
 
 
 def any_adapts(rows: Sequence[Row]) -> bool:
@@ -225,5 +225,5 @@ def baselines_of(rows: Sequence[Row]) -> list[str]:
     jobs: list[Result] = []
     for row in rows:
         jobs += row.jobs
-    found = any_baselines(jobs)
-    return [baseline for baseline in found if baseline in {"driver_specific", "pooled"}]
+    baselines = any_baselines(jobs)
+    return [baseline for baseline in baselines if baseline in {"driver_specific", "pooled"}]

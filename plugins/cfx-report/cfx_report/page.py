@@ -47,10 +47,11 @@ def render(runs: Runs, title: str | None = None) -> str:
 
     environment = _environment(runs)
     sections = []
-    for one in registry.installed("section"):
-        body = one.attempt(lambda section: _section(environment, section, runs), "")
+    for installed in registry.installed("section"):
+        body = installed.attempt(lambda section: _section(environment, section, runs), "")
         if body.strip():
-            sections.append((one.name, one.component, Markup(body)))  # noqa: S704 - a template's
+            markup = Markup(body)  # noqa: S704 - a template's
+            sections.append((installed.name, installed.component, markup))
     scripts = inline_scripts([asset(name) for name in _SCRIPTS])
     return environment.get_template("page.html.j2").render(
         title=title or _title(runs.jobs),
@@ -98,12 +99,12 @@ def _environment(runs: Runs) -> Environment:
 
 def _drawn(environment: Environment, name: str, job: Result) -> Any:
     """Returns the figure of a name as the job has written it; "" if the job lacks its data."""
-    found = drawing.figure_named(name)
-    drawn = drawing.draw_figure(found, job)
+    drawable = drawing.figure_named(name)
+    drawn = drawing.draw_figure(drawable, job)
     if drawn is None:
         return ""
     figure: Any = environment.globals["figure"]
-    return figure({"": View(drawn)}, found.component.title)
+    return figure({"": View(drawn)}, drawable.component.title)
 
 
 def _section(environment: Environment, section: Section, runs: Runs) -> str:

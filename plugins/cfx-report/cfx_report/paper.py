@@ -135,11 +135,11 @@ def _parameter_tables(rows: Sequence[Row]) -> Iterator[str]:
         spreads = spreads_of(job) if job.purpose is Purpose.CALIBRATION else ()
         if not spreads:
             continue
-        found = sheet(spreads, slices_of(job))
+        parameters = sheet(spreads, slices_of(job))
         lines = []
-        for line in found.rows:
+        for line in parameters.rows:
             lines.append([cell.text for cell in line])
-        table = pd.DataFrame(lines, columns=[column.heading for column in found.columns])
+        table = pd.DataFrame(lines, columns=[column.heading for column in parameters.columns])
         name = _ESCAPED.sub(r"\\\g<0>", row.name)
         caption = (
             f"Calibrated parameters, {name}: the model's default, the mean of the folds' pooled"
@@ -161,35 +161,35 @@ def _amounts(row: Row) -> dict[str, int]:
 
 
 def _spread(name: str, values: np.ndarray) -> dict[str, float]:
-    known = values[np.isfinite(values)]
-    if not len(known):
+    measured = values[np.isfinite(values)]
+    if not len(measured):
         return {name: math.nan}
-    found = {name: float(known.mean())}
+    spread = {name: float(measured.mean())}
     if len(values) > 1:
-        found[f"{name}/sd"] = float(known.std(ddof=1)) if len(known) > 1 else math.nan
-    return found
+        spread[f"{name}/sd"] = float(measured.std(ddof=1)) if len(measured) > 1 else math.nan
+    return spread
 
 
 def _text(values: np.ndarray, digits: int = 3) -> str:
-    known = values[np.isfinite(values)]
-    if not len(known):
+    measured = values[np.isfinite(values)]
+    if not len(measured):
         return "--"
-    if len(known) == 1:
-        return f"{known[0]:.{digits}f}"
-    return f"{known.mean():.{digits}f} ± {known.std(ddof=1):.{digits}f}"
+    if len(measured) == 1:
+        return f"{measured[0]:.{digits}f}"
+    return f"{measured.mean():.{digits}f} ± {measured.std(ddof=1):.{digits}f}"
 
 
 def _improvement(row: Row, baseline: str) -> str:
     values = row.improvements("geometric", baseline)
-    known = 100 * values[np.isfinite(values)]
-    if not len(known):
+    percentages = 100 * values[np.isfinite(values)]
+    if not len(percentages):
         return "--"
-    if len(known) > 1:
-        return f"{known.mean():+.1f} ± {known.std(ddof=1):.1f} %"
+    if len(percentages) > 1:
+        return f"{percentages.mean():+.1f} ± {percentages.std(ddof=1):.1f} %"
     low, high = (100 * row.improvements(end, baseline)[0] for end in ("ci95_low", "ci95_high"))
     if not math.isfinite(low):
-        return f"{known[0]:+.1f} %"
-    return f"{known[0]:+.1f} % ({low:+.1f} to {high:+.1f})"
+        return f"{percentages[0]:+.1f} %"
+    return f"{percentages[0]:+.1f} % ({low:+.1f} to {high:+.1f})"
 
 
 def _command(job: Result) -> str:

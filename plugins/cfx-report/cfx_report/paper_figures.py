@@ -111,13 +111,13 @@ def draw(
     said = []
     with canvas.on_paper(canvas.Paper(width_mm / 25.4, font_size)):
         for job in jobs:
-            own = Path(job.place) / "figures"
+            target = Path(job.place) / "figures"
             if folder is not None or not Path(job.place).is_dir():
-                own = Path(folder or "figures").expanduser()
+                target = Path(folder or "figures").expanduser()
                 if len(jobs) > 1:
-                    own /= job.name
-            paths = drawing.write_figures(own, job, figures.values(), formats=formats)
-            said.append(f"{wording.plural(len(paths), 'file')} in {own.absolute()}")
+                    target /= job.name
+            paths = drawing.write_figures(target, job, figures.values(), formats=formats)
+            said.append(f"{wording.plural(len(paths), 'file')} in {target.absolute()}")
         if len(jobs) > 1 and only is None:
             said += _compared(jobs, Path(folder or "figures").expanduser(), formats)
     return said
@@ -158,7 +158,7 @@ def _width_mm(text: str) -> float:
     return width
 
 
-def _words(text: str, option: str, known: Sequence[str]) -> tuple[str, ...]:
+def _words(text: str, option: str, allowed: Sequence[str]) -> tuple[str, ...]:
     """Returns words that stand with commas between them.
 
     Raises:
@@ -168,9 +168,9 @@ def _words(text: str, option: str, known: Sequence[str]) -> tuple[str, ...]:
 
     words = tuple(word.strip() for word in text.split(",") if word.strip())
     for word in words or ("",):
-        if word not in known:
+        if word not in allowed:
             raise ConfigError(
-                f"{option} {text}: there is no '{word}'.{nearest(word, known)} Known:"
-                f" {', '.join(known)}."
+                f"{option} {text}: there is no '{word}'.{nearest(word, allowed)} Known:"
+                f" {', '.join(allowed)}."
             )
     return words

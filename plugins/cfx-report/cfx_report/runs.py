@@ -34,18 +34,18 @@ def read_runs(runs: Sequence[str]) -> Runs:
         TrackingError: there is no such run.
     """
     jobs: dict[str, Result] = {}
-    given: dict[str, int] = {}
+    order: dict[str, int] = {}  # as the runs are listed
     unfinished: dict[str, Unfinished] = {}
     for number, run in enumerate(runs):
-        for found in _read(run):
-            if isinstance(found, Result):
-                jobs.setdefault(found.place, found)
-                given.setdefault(found.place, number)
+        for result in _read(run):
+            if isinstance(result, Result):
+                jobs.setdefault(result.place, result)
+                order.setdefault(result.place, number)
             else:
-                unfinished.setdefault(found.place, found)
+                unfinished.setdefault(result.place, result)
     # Folders of a sweep are named by content: only the jobs' names have an order that people see.
     ordered = sorted(
-        named(tuple(jobs.values())), key=lambda job: (given[job.place], natural_order(job.name))
+        named(tuple(jobs.values())), key=lambda job: (order[job.place], natural_order(job.name))
     )
     return Runs(tuple(ordered), tuple(unfinished.values()))
 
@@ -75,28 +75,31 @@ def _of_folder(folder: Path, place: Callable[[Path], str]) -> list[Result | Unfi
             f"{folder} is a file; give a job's output folder, a sweep's folder, or the id of an"
             " MLflow run"
         )
-    found = [_one(job, place(job)) for job in _job_folders(folder)]
-    if not any(isinstance(one, Result) for one in found):
+    jobs = [_one(job, place(job)) for job in _job_folders(folder)]
+    if not any(isinstance(result, Result) for result in jobs):
         raise DataError(
-            f"{folder} holds no finished job (a finished one has a metrics.json){_reasons(found)}"
+            f"{folder} holds no finished job (a finished one has a metrics.json){_reasons(jobs)}"
         )
-    return found
+    return jobs
 
 
 def _of_mlflow(run: str) -> list[Result | Unfinished]:
-    found: list[Result | Unfinished] = []
-    for one in tracking_of_run(run).jobs_of_run(run):
-        found.append(Unfinished(one.place, one.reason) if one.folder is None else _whole(one))
-    if not any(isinstance(one, Result) for one in found):
-        raise DataError(f"run {run} holds no finished job{_reasons(found)}")
-    return found
+    jobs: list[Result | Unfinished] = []
+    for tracked in tracking_of_run(run).jobs_of_run(run):
+        if tracked.folder is None:
+            jobs.append(Unfinished(tracked.place, tracked.reason))
+        else:
+            jobs.append(_whole(tracked))
+    if not any(isinstance(result, Result) for result in jobs):
+        raise DataError(f"run {run} holds no finished job{_reasons(jobs)}")
+    return jobs
 
 
-def _reasons(found: Sequence[Result | Unfinished]) -> str:
+def _reasons(jobs: Sequence[Result | Unfinished]) -> str:
     text = ""
-    for one in found:
-        if isinstance(one, Unfinished):
-            text += f"; {one.place}: {one.reason}"
+    for job in jobs:
+        if isinstance(job, Unfinished):
+            text += f"; {job.place}: {job.reason}"
     return text
 
 

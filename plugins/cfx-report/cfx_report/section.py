@@ -158,11 +158,14 @@ class Sheet:
     @classmethod
     def of(cls, columns: Sequence[Column[R]], rows: Iterable[R]) -> Sheet:
         """Returns a table with a row for each of `rows`."""
-        found = []
+        lines = []
         for row in rows:
-            cells = [column.cell(row) for column in columns]
-            found.append(tuple(text(cell) if isinstance(cell, str) else cell for cell in cells))
-        return cls(tuple(columns), tuple(found))
+            cells = []
+            for column in columns:
+                cell = column.cell(row)
+                cells.append(text(cell) if isinstance(cell, str) else cell)
+            lines.append(tuple(cells))
+        return cls(tuple(columns), tuple(lines))
 
     @property
     def groups(self) -> list[tuple[str, int]]:

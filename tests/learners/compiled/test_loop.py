@@ -63,7 +63,8 @@ def both(built: Any, path: Any) -> list[list[Tensor]]:
         built.compiled = used
         built.network.zero_grad()
         losses = []
-        for loss in built.trajectory_losses(step, batch, 6, divisors, path):
+        for segment in built.simulated(step, batch, 6, path):
+            loss = built.trajectory_loss(segment, divisors)
             if loss.requires_grad:
                 (loss * batch.weight).sum().backward()
             losses.append(loss.detach())

@@ -194,7 +194,8 @@ def test_the_path_without_noise_counts_beside_sampled_ones() -> None:
     torch.testing.assert_close(found, centre + crps)
     assert settings.epochs > 1
     path = module.through_time
-    early = next(module.trajectory_losses(module.exact_step, batch, 4, divisors, path))
+    segment = next(module.simulated(module.exact_step, batch, 4, path))
+    early = module.trajectory_loss(segment, divisors)
     torch.testing.assert_close(early.detach(), centre, msg="it is learned first")
 
 
@@ -236,7 +237,8 @@ def exact_losses(module: RolloutModule, batch: RolloutBatch, windows: int, full:
     divisors = module.shard.errors.over_horizon(batch)
     if full:
         divisors = module.shard.errors.over_full_trajectory(batch)
-    return next(module.trajectory_losses(module.exact_step, batch, windows, divisors))
+    segment = next(module.simulated(module.exact_step, batch, windows))
+    return module.trajectory_loss(segment, divisors)
 
 
 @pytest.mark.parametrize(

@@ -114,28 +114,28 @@ class RecalibrateNetwork(EstimatorNetwork):
 
     def updated(self, history: History, belief: Tensor) -> Tensor:
         """Appends the frames of a window that are new; the estimate waits until it is asked for."""
-        estimate, known, frames = self._parts(belief)
+        estimate, recorded, frames = self._parts(belief)
         token = torch.stack([history[name] for name in OBSERVED], -2)
-        new = torch.where(known > 0, _new_frames(frames[..., -1], token), token.shape[-1])
+        new = torch.where(recorded > 0, _new_frames(frames[..., -1], token), token.shape[-1])
         index = torch.arange(self._kept, device=belief.device) + new[..., None]
         both = torch.cat([frames, token], -1)
         # Of the token only the new frames are appended: the last ones.
         skip = (token.shape[-1] - new)[..., None]
         index = torch.where(index >= self._kept, index + skip, index)
         index = index[..., None, :].expand(*frames.shape[:-1], self._kept)
-        known = (known + new).clamp(max=self._kept)
+        recorded = (recorded + new).clamp(max=self._kept)
         frames = both.gather(-1, index)
-        return torch.cat([estimate, known[..., None], frames.flatten(-2)], -1)
+        return torch.cat([estimate, recorded[..., None], frames.flatten(-2)], -1)
 
     def concluded(self, belief: Tensor, due: Tensor) -> Tensor:
-        _, known, frames = self._parts(belief)
-        wanted = due & (known > self._least)
+        _, recorded, frames = self._parts(belief)
+        wanted = due & (recorded > self._least)
         if not bool(wanted.any()):
             return belief
         prior = squashed(self.prior)[:, None].expand(*belief.shape[:-1], -1)
-        found = self._calibrated(frames[wanted], known[wanted].long(), prior[wanted])
+        estimates = self._calibrated(frames[wanted], recorded[wanted].long(), prior[wanted])
         belief = belief.clone()
-        belief[wanted, : found.shape[-1]] = found
+        belief[wanted, : estimates.shape[-1]] = estimates
         return belief
 
     def estimate(self, belief: Tensor) -> Tensor:
@@ -147,9 +147,9 @@ class RecalibrateNetwork(EstimatorNetwork):
         frames = belief[..., n + 1 :].reshape(*belief.shape[:-1], _SIGNALS, self._kept)
         return belief[..., :n], belief[..., n], frames
 
-    def _calibrated(self, frames: Tensor, known: Tensor, prior: Tensor) -> Tensor:
+    def _calibrated(self, frames: Tensor, recorded: Tensor, prior: Tensor) -> Tensor:
         """Calibrates D drivers; `(D, 5, T)`, `(D,)` and `(D, n)` to squashed `(D, n)`."""
-        losses = self._losses(frames, known)
+        losses = self._losses(frames, recorded)
         unit = prior.double().sigmoid()[:, None]
         wanted = replace(losses, prior=Prior.of(losses, unit, prior[:, None], self._weight))
         solution = self._optimizer.minimize(
@@ -161,9 +161,9 @@ class RecalibrateNetwork(EstimatorNetwork):
         )
         return squashed(solution.best).to(prior)
 
-    def _losses(self, frames: Tensor, known: Tensor) -> SegmentLosses:
+    def _losses(self, frames: Tensor, recorded: Tensor) -> SegmentLosses:
         """Returns the losses of D drivers over the frames that are known of them."""
-        index = torch.arange(self._kept, device=frames.device) + (self._kept - known)[:, None]
+        index = torch.arange(self._kept, device=frames.device) + (self._kept - recorded)[:, None]
         index = index.clamp(max=self._kept - 1)
         known_frames = frames.gather(-1, index[:, None].expand_as(frames))
         signals = dict(zip(OBSERVED, known_frames.unbind(-2), strict=True))
@@ -179,7 +179,7 @@ class RecalibrateNetwork(EstimatorNetwork):
             leader_rear=ahead[:, 1:].T,
             measured_speed=signals["follower_speed"][:, 1:].T,
             measured_gap=signals["gap"][:, 1:].T,
-            counted=(steps < known - 1).to(frames.dtype),
+            counted=(steps < recorded - 1).to(frames.dtype),
             leader_length=start,
             position=start,
             speed=signals["follower_speed"][:, 0],

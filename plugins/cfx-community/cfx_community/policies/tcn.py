@@ -163,11 +163,11 @@ class TcnNetwork(PolicyNetwork):
 
     @property
     def _convolutions(self) -> list[CausalConvolution]:
-        found = []
+        convolutions = []
         for block in self.blocks:
             assert isinstance(block, ResidualBlock)
-            found += [block.first, block.second]
-        return found
+            convolutions += [block.first, block.second]
+        return convolutions
 
     def initial_state(self, networks: int, drivers: int) -> Tensor:
         width = sum(self._widths())

@@ -21,7 +21,7 @@ def installed_code() -> Mapping[str, str]:
     for kind in registry.KINDS:
         for entry in registry.entries(kind):
             packages.setdefault(entry.distribution, set()).add(entry.package)
-    return {name: _hash(found) for name, found in packages.items()}
+    return {name: _hash(package) for name, package in packages.items()}
 
 
 def differing(here: Mapping[str, str], there: Mapping[str, str]) -> list[str]:

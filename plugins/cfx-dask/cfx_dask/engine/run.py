@@ -128,12 +128,12 @@ class Run(Generic[engine.ShardT, engine.ResultT]):
             from distributed import CancelledError
 
             try:
-                found = future.result(timeout=self._settings.patience)
+                answer = future.result(timeout=self._settings.patience)
             except (CancelledError, TimeoutError, OSError):
                 self._again(attempt, "its result was lost")
                 return
-            self._report(found.units)
-            yield attempt.number, found.result
+            self._report(answer.units)
+            yield attempt.number, answer.result
             return
         self._unfinished(future, attempt)
 

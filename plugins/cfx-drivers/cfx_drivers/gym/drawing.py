@@ -23,13 +23,13 @@ def picture(fronts: Sequence[float], lengths: Sequence[float]) -> NDArray[Any]:
         fronts: front bumpers of the leader, the ego and the vehicles behind, m.
         lengths: of these vehicles, m.
     """
-    found = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
-    found[:] = _ROAD
-    found[[6, HEIGHT - 7]] = _LINE
+    image = np.empty((HEIGHT, WIDTH, 3), dtype=np.uint8)
+    image[:] = _ROAD
+    image[[6, HEIGHT - 7]] = _LINE
     for number, (front, length) in enumerate(zip(fronts, lengths, strict=True)):
         ahead = (front - fronts[1]) * _PIXELS_PER_M + WIDTH / 2
         right = min(max(round(ahead), 0), WIDTH)
         left = min(max(round(ahead - length * _PIXELS_PER_M), 0), WIDTH)
         colour = (_LEADER, _EGO, _BEHIND)[min(number, 2)]
-        found[HEIGHT // 2 - 5 : HEIGHT // 2 + 5, left:right] = colour
-    return found
+        image[HEIGHT // 2 - 5 : HEIGHT // 2 + 5, left:right] = colour
+    return image

@@ -78,11 +78,11 @@ class CfxVehicle(IDMVehicle):  # type: ignore[misc]  # highway-env has no types
     def step(self, dt: float) -> None:
         self._last_speed = float(self.speed)
         if self._driven is not None:
-            own = _step_of(self.driver).dt
-            if abs(dt - own) > 1e-6:
+            step_s = _step_of(self.driver).dt
+            if abs(dt - step_s) > 1e-6:
                 raise ConfigError(
-                    f"the simulation steps by {dt:g} s, the driver by {own:g} s; configure"
-                    f" simulation_frequency={1 / own:g}"
+                    f"the simulation steps by {dt:g} s, the driver by {step_s:g} s; configure"
+                    f" simulation_frequency={1 / step_s:g}"
                 )
             self.speed = self._driven
             self.action["acceleration"] = 0.0  # it has the speed at the step's end already

@@ -231,13 +231,13 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
             return ()
         ahead, _, _ = self._leader()
         lengths = self._batch.leader_length[self._pair].tolist()
-        own = [LENGTH_M] * (1 + self._followers)
-        found = []
+        of_followers = [LENGTH_M] * (1 + self._followers)
+        pictures = []
         for front, length, behind in zip(
             ahead.tolist(), lengths, self._position.tolist(), strict=True
         ):
-            found.append(picture([front, *behind], [length, *own]))
-        return tuple(found)
+            pictures.append(picture([front, *behind], [length, *of_followers]))
+        return tuple(pictures)
 
     def _begin_nothing(self) -> None:
         """Makes room for the state of all environments."""
@@ -258,8 +258,8 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
         return torch.from_numpy(self.np_random.integers(len(self.pairs), size=count))
 
     def _number(self, pair: object) -> int:
-        for number, one in enumerate(self.pairs):
-            if one.pair_id == names.name_of(pair):
+        for number, recorded in enumerate(self.pairs):
+            if recorded.pair_id == names.name_of(pair):
                 return number
         raise ConfigError(f"options: the recording has no pair '{pair}'")
 
@@ -351,7 +351,7 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
 
     def _information(self, outcome: Outcome) -> dict[str, Any]:
         """Returns what Gymnasium calls info: arrays, and which of their entries count."""
-        found: dict[str, Any] = {
+        information: dict[str, Any] = {
             "pair": self._pair.numpy().copy(),
             "time_s": (self._frame.double() * self.dt).numpy(),
             "recorded_speed": outcome.recorded_speed,
@@ -359,7 +359,7 @@ class CarFollowingVectorEnv(VectorEnv[Array, Array, Array]):
             "collided": outcome.collided,
         }
         everyone = np.ones(self.num_envs, dtype=bool)
-        return {**found, **{f"_{name}": everyone for name in found}}
+        return {**information, **{f"_{name}": everyone for name in information}}
 
 
 def of_first(information: Mapping[str, Any]) -> dict[str, Any]:

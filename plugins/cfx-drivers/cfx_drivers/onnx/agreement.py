@@ -78,9 +78,9 @@ def largest_difference(step: DriverStep, run: Run) -> float:
                 given[name] = value.numpy()
         if step.noise_width:
             given["noise"] = noise.numpy()
-        found = run(given)
+        computed = run(given)
         expected, state = _expected(step, state, values, noise)
-        difference = float(np.abs(found - expected).max())
+        difference = float(np.abs(computed - expected).max())
         worst = float(np.maximum(worst, difference))  # NaN, if there is one
         acceleration = (expected - speed) / step.dt
         position = position + expected * step.dt

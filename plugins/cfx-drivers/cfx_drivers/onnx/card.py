@@ -14,7 +14,7 @@ def card(graph: onnx.ModelProto, run: str, size: int, difference: float) -> str:
         size: of the file, bytes.
         difference: of speeds from cfx's, m/s.
     """
-    about = {one.key: one.value for one in graph.metadata_props}
+    about = {item.key: item.value for item in graph.metadata_props}
     lines = [
         f"# {run}",
         "",
@@ -34,7 +34,7 @@ def card(graph: onnx.ModelProto, run: str, size: int, difference: float) -> str:
     ]
     for tensor in (*graph.graph.input, *graph.graph.output):
         kind = tensor.type.tensor_type
-        shape = ", ".join(one.dim_param or str(one.dim_value) for one in kind.shape.dim)
+        shape = ", ".join(item.dim_param or str(item.dim_value) for item in kind.shape.dim)
         name = onnx.TensorProto.DataType.Name(kind.elem_type).lower()
         lines.append(f"| `{tensor.name}` | {name} ({shape}) | {tensor.doc_string} |")
     return "\n".join([*lines, ""])

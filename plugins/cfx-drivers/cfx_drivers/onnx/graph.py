@@ -172,18 +172,20 @@ def _strip(model: onnx.ModelProto) -> None:
 
 def _describe(model: onnx.ModelProto, step: DriverStep, run: str) -> None:
     """Writes meanings and units into the graph, and what it is into its metadata."""
-    known = {**signals_of(step), "noise": NOISE, **STATE, "next_speed": NEXT_SPEED}
+    described = {**signals_of(step), "noise": NOISE, **STATE, "next_speed": NEXT_SPEED}
     about = {
         "cfx.version": cfx.__version__,
         "cfx.policy": run,
         "cfx.model": str(step.agent.model_node["name"]),
         "cfx.dt": f"{step.dt:g} s",
         "cfx.signals": " ".join(signals_of(step)),
-        "cfx.parameters": ", ".join(f"{one.name} [{one.unit}]" for one in step.agent.space.tuned),
+        "cfx.parameters": ", ".join(
+            f"{parameter.name} [{parameter.unit}]" for parameter in step.agent.space.tuned
+        ),
     }
     for tensor in (*model.graph.input, *model.graph.output):
         name = tensor.name
-        unit, meaning = known[name if name in known else name.removeprefix("next_")]
+        unit, meaning = described[name if name in described else name.removeprefix("next_")]
         tensor.doc_string = f"{meaning} [{unit}]"
         about[f"unit.{name}"] = unit
         about[f"meaning.{name}"] = meaning

@@ -37,9 +37,9 @@ class OsmpExport(ExportFormat):
             )
         about = f"A driver that cfx trained, who decides every {step.dt:g} s: {run}"
         is_random = bool(step.noise_width)
-        own = [_FOLDER / MAIN, _FOLDER / "scene.h", *_FOLDER.glob("osi.*")]
+        sources = [_FOLDER / MAIN, _FOLDER / "scene.h", *_FOLDER.glob("osi.*")]
         library = sorted(_FOLDER.glob("nanopb/*.[ch]"))
-        with built(run, step, [*sorted(own), *library], "osmp") as unit:
+        with built(run, step, [*sorted(sources), *library], "osmp") as unit:
             contents = {
                 "modelDescription.xml": description_of(step.dt, unit.token, about, is_random, MAIN),
                 "documentation/licenses/nanopb.txt": (

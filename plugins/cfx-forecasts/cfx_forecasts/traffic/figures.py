@@ -106,9 +106,9 @@ def traffic_panels(
     if len(growth):
         lines = []
         for method in methods:
-            found = mean_growth(growth[growth["method"] == method])
-            place = found.index.to_numpy(dtype=float)
-            lines.append(canvas.Line(method, place, found.to_numpy(dtype=float)))
+            means = mean_growth(growth[growth["method"] == method])
+            place = means.index.to_numpy(dtype=float)
+            lines.append(canvas.Line(method, place, means.to_numpy(dtype=float)))
         limits = _growth_limits(lines)
         panels.append(
             TrafficPanel("std of speed (m/s)", VEHICLE_TITLE, tuple(lines), limits=limits)
@@ -136,8 +136,8 @@ def _flows(
 ) -> tuple[canvas.Line, ...]:
     lines = []
     for method in methods:
-        found = ring_means(roads[roads["method"] == method], ["flow"])
-        lines.append(_line(method, found["level"], found["flow"]))
+        means = ring_means(roads[roads["method"] == method], ["flow"])
+        lines.append(_line(method, means["level"], means["flow"]))
     return (*lines, *_of_bins(bins, (RECORDED,), "flow"))
 
 
@@ -152,8 +152,8 @@ def _of_bins(bins: pd.DataFrame, methods: Sequence[str], column: str) -> tuple[c
 def _waves(roads: pd.DataFrame, real: float, methods: Sequence[str]) -> tuple[canvas.Line, ...]:
     lines = []
     for method in methods:
-        found = ring_means(roads[roads["method"] == method], ["wave_speed"])
-        lines.append(_line(method, found["level"], found["wave_speed"]))
+        means = ring_means(roads[roads["method"] == method], ["wave_speed"])
+        lines.append(_line(method, means["level"], means["wave_speed"]))
     if np.isfinite(real):
         rings = roads[roads["road"] == "ring"]
         ends = np.array([rings["level"].min(), rings["level"].max()], dtype=float)

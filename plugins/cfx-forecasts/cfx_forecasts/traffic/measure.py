@@ -55,11 +55,14 @@ class Settled(NamedTuple):
 
     def of_road(self, road: roads.Road) -> Settled:
         """Returns the vehicles of one road."""
-        own = road.vehicles
+        vehicles = road.vehicles
         return Settled(
-            self.position[own], self.speed[own], self.ahead[own], self.ahead_speed[own],
+            self.position[vehicles],
+            self.speed[vehicles],
+            self.ahead[vehicles],
+            self.ahead_speed[vehicles],
             self.interval,
-        )  # fmt: skip
+        )
 
 
 class Measured(NamedTuple):
@@ -212,9 +215,13 @@ def _ring_strips(lanes: roads.Lanes, settled: Settled) -> Strips:
     parts = []
     for road in lanes.roads:
         if road.kind == "ring":
-            own = settled.of_road(road)
-            counted = torch.ones_like(own.speed, dtype=torch.bool)
-            parts.append(strips_of(own.ahead - own.position, own.speed, counted, own.interval))
+            on_road = settled.of_road(road)
+            counted = torch.ones_like(on_road.speed, dtype=torch.bool)
+            parts.append(
+                strips_of(
+                    on_road.ahead - on_road.position, on_road.speed, counted, on_road.interval
+                )
+            )
     return Strips(*(torch.cat(columns) for columns in zip(*parts, strict=True)))
 
 

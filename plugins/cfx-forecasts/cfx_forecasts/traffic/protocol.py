@@ -321,7 +321,7 @@ def _constant_kinds(
     agent = context.agents.constant(FixedPolicy(), parameters)
     kinds = {name: _Kind(agent, agent.begin(each), draws=False)}
     if noise is None:
-        time, scale = residual_noise(test, parameters, own=name == "driver_specific")
+        time, scale = residual_noise(test, parameters, of_driver=name == "driver_specific")
         log.info(
             "Noise of %s_ar as measured: %.2f m/s2 that lasts %.1f s",
             name,

@@ -84,14 +84,14 @@ that keep their speed: what vehicles add by themselves.</p>
 
     def context(self, runs: Runs) -> Mapping[str, Any] | None:
         """Return a table for each job with traffic."""
-        found = []
+        roads = []
         methods: list[str] = []
         for job in runs.jobs:
             table = job.tables.get("traffic")
             if table is not None:
-                found.append((job, traffic_sheet(job, table)))
+                roads.append((job, traffic_sheet(job, table)))
                 methods += traffic_methods(table)
-        return {"roads": found, "methods": methods_explained(methods)} if found else None
+        return {"roads": roads, "methods": methods_explained(methods)} if roads else None
 
 
 def traffic_sheet(job: Result, roads: pd.DataFrame) -> Sheet:

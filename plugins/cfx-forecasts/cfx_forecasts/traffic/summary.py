@@ -61,7 +61,7 @@ def traffic_metrics(
         roads, growth, strips: the tables `Roads`, `Growth` and `Strips`.
         real_wave_speed: of the recording, km/h (`PairWaves.speed`).
     """
-    found: dict[str, float] = {}
+    metrics: dict[str, float] = {}
     bins = binned(strips)
     errors = flow_errors(bins)
     variations = common_variation(bins)
@@ -71,17 +71,17 @@ def traffic_metrics(
         values["flow_error"] = errors.get(method, math.nan)
         values["speed_std"] = variations.get(method, math.nan)
         for name, value in values.items():
-            found[f"traffic/{name}/{method}"] = value
-    found[f"traffic/wave_speed/{RECORDED}"] = real_wave_speed
-    found[f"traffic/speed_std/{RECORDED}"] = variations.get(RECORDED, math.nan)
-    return found
+            metrics[f"traffic/{name}/{method}"] = value
+    metrics[f"traffic/wave_speed/{RECORDED}"] = real_wave_speed
+    metrics[f"traffic/speed_std/{RECORDED}"] = variations.get(RECORDED, math.nan)
+    return metrics
 
 
 def traffic_methods(roads: pd.DataFrame) -> tuple[str, ...]:
     """Returns the methods of a table of roads in the order in which they are shown."""
     present = roads["method"].astype(str).unique().tolist()
-    known = [method for method in TRAFFIC_METHODS if method in present]
-    return (*known, *(method for method in present if method not in known))
+    ordered = [method for method in TRAFFIC_METHODS if method in present]
+    return (*ordered, *(method for method in present if method not in ordered))
 
 
 def binned(strips: pd.DataFrame) -> pd.DataFrame:
@@ -101,28 +101,28 @@ def binned(strips: pd.DataFrame) -> pd.DataFrame:
     table = strips.assign(middle=middle, area=area, way=area * strips["flow"])
     grouped = table.groupby(["method", "middle"], sort=True, observed=True)
     sums = grouped[["area", "way"]].sum()
-    found = pd.DataFrame(
+    bins = pd.DataFrame(
         {
             "flow": sums["way"] / sums["area"],
             "speed_std": grouped["speed_std"].mean(),
             "strips": grouped.size(),
         }
     )
-    found = found.reset_index().rename(columns={"middle": "density"})
-    return found[found["strips"] >= _LEAST_STRIPS].reset_index(drop=True)
+    bins = bins.reset_index().rename(columns={"middle": "density"})
+    return bins[bins["strips"] >= _LEAST_STRIPS].reset_index(drop=True)
 
 
 def flow_errors(bins: pd.DataFrame) -> dict[str, float]:
     """Returns by method the RMS difference of flows to the recording, over the bins of both."""
     wide = bins.pivot_table(index="density", columns="method", values="flow")
-    found: dict[str, float] = {}
+    errors: dict[str, float] = {}
     if RECORDED not in wide:
-        return found
+        return errors
     for method in wide:
         off = (wide[method] - wide[RECORDED]).dropna()
         if method != RECORDED and len(off):
-            found[str(method)] = float(np.sqrt((off**2).mean()))
-    return found
+            errors[str(method)] = float(np.sqrt((off**2).mean()))
+    return errors
 
 
 def common_variation(bins: pd.DataFrame) -> dict[str, float]:

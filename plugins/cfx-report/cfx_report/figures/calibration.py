@@ -88,8 +88,8 @@ def slice_panels(table: pd.DataFrame, axes: Sequence[ParameterAxis]) -> tuple[Sl
         if not len(ratios):
             continue
         values = rows.drop_duplicates("place").sort_values("place")["value"]
-        known = shares[axis.name].dropna()
-        near, flat = float(known.median()), float((known == 1).mean())
+        measured = shares[axis.name].dropna()
+        near, flat = float(measured.median()), float((measured == 1).mean())
         places = wide.columns.to_numpy(dtype=np.float64)
         of_axis = values.to_numpy(dtype=np.float64)
         panels.append(SlicePanel(axis, places, of_axis, ratios, near, flat))
@@ -104,15 +104,15 @@ def fits_of(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
             was calibrated on and on the test part, without which there is nothing to show.
     """
     errors = ["train_rmse_speed", "test_rmse_speed"]
-    found: dict[str, pd.DataFrame] = {}
+    fits: dict[str, pd.DataFrame] = {}
     if "test_rmse_speed" not in table:
-        return found
+        return fits
     for method in ("driver_specific", "pooled", "default"):
         rows = table[table["method"] == method]
-        known = np.isfinite(rows[errors].to_numpy(dtype=float)).all(axis=1)
-        if known.any():
-            found[method] = rows.loc[known]
-    return found
+        measured = np.isfinite(rows[errors].to_numpy(dtype=float)).all(axis=1)
+        if measured.any():
+            fits[method] = rows.loc[measured]
+    return fits
 
 
 def labels_of(
@@ -136,24 +136,29 @@ def labels_of(
             names.append(axis.name)
     if labels.empty or not names:
         return {}
-    own = (
+    driver_specific = (
         pairs[pairs["method"] == "driver_specific"].drop_duplicates("pair_id").set_index("pair_id")
     )
     ids = labels["pair_id"].astype(str)
-    known = []
-    for one in own.index.astype(str):
-        if one in set(ids):
-            known.append(one)
-    if not known:
+    candidates = []
+    for candidate in driver_specific.index.astype(str):
+        if candidate in set(ids):
+            candidates.append(candidate)
+    if not candidates:
         return {}
     scale = float(np.quantile(labels["sensitivity"].to_numpy(dtype=float), 0.9)) or 1.0
-    places = np.linspace(0, len(known) - 1, min(len(known), MOST_DRIVERS)).round().astype(int)
-    found = {}
-    for pair_id in (known[place] for place in places):
+    places = (
+        np.linspace(0, len(candidates) - 1, min(len(candidates), MOST_DRIVERS)).round().astype(int)
+    )
+    drawn = {}
+    for pair_id in (candidates[place] for place in places):
         rows = labels[ids == pair_id].sort_values("time_s")
-        fixed = {f"fixed_{name}": float(own.loc[pair_id, f"parameter_{name}"]) for name in names}
-        found[pair_id] = rows.assign(weight=(rows["sensitivity"] / scale).clip(0, 1), **fixed)
-    return found
+        fixed = {
+            f"fixed_{name}": float(driver_specific.loc[pair_id, f"parameter_{name}"])
+            for name in names
+        }
+        drawn[pair_id] = rows.assign(weight=(rows["sensitivity"] / scale).clip(0, 1), **fixed)
+    return drawn
 
 
 _ACROSS = 5
@@ -210,10 +215,10 @@ def draw_fits(fits: Mapping[str, pd.DataFrame]) -> Figure:
     for method, rows in fits.items():
         train = rows["train_rmse_speed"].to_numpy(dtype=float)
         test = rows["test_rmse_speed"].to_numpy(dtype=float)
-        own, colour = method == "driver_specific", colours.colour_of(method)
+        is_driver_specific, colour = method == "driver_specific", colours.colour_of(method)
         highest = max(highest, float(np.quantile(np.concatenate([train, test]), 0.98)))
         medians = f"median {np.median(train):.2f} and {np.median(test):.2f} m/s"
-        size, above, filled = (4.5, 3, colour) if own else (5.5, 2, "none")
+        size, above, filled = (4.5, 3, colour) if is_driver_specific else (5.5, 2, "none")
         drawn = canvas.draw_points(axes, train, test, _MARKERS[method], colour, size, alpha=0.65)
         drawn.set(
             label=canvas.wrapped(f"{wording.method_label(method)}: {medians}"),
@@ -314,8 +319,8 @@ class FitTrainTest(JobFigure):
     def draw(self, result: Result) -> Figure | None:
         """Draws it where errors on both parts are known."""
         table = result.tables.get("fits")
-        found = {} if table is None else fits_of(table)
-        return draw_fits(found) if found else None
+        fits = {} if table is None else fits_of(table)
+        return draw_fits(fits) if fits else None
 
 
 class LabelsOverTime(JobFigure):

@@ -29,8 +29,8 @@ def draw_error_distribution(pairs: pd.DataFrame, methods: Sequence[str]) -> Figu
         canvas.side_by_side(figure, (1, 1)), _ERRORS.items(), strict=True
     ):
         for method in methods:
-            own = pairs.loc[pairs["method"] == method, column]
-            errors = np.sort(canvas.finite(own.to_numpy(dtype=float)))
+            measured = pairs.loc[pairs["method"] == method, column]
+            errors = np.sort(canvas.finite(measured.to_numpy(dtype=float)))
             if len(errors):
                 axes.ecdf(
                     errors,

@@ -1,4 +1,4 @@
-"""Improvements of the policy by the history that it has read."""
+"""Figure: how much a policy gains from the measured history that it observes before the test."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ def history_curves(history: pd.DataFrame) -> pd.DataFrame:
         history: as `Evaluation.history`.
 
     Returns:
-        A row per base and amount, each in its order: `base`, `amount`, `geometric`, `low` and
-        `high` (fractions; the improvement and its 95 % interval over drivers), `pairs` with a
-        defined improvement.
+        A row per base and amount of burn-in. `base` is in the order of `BASES`, `amount` as
+        `amounts_of` sorts it. `geometric`, `low` and `high` are the improvement and the ends of its
+        95 % interval over drivers, as fractions. `pairs` counts pairs whose improvement is defined.
     """
     from cfx.plugin import statistics  # imports scipy
 
@@ -32,14 +32,24 @@ def history_curves(history: pd.DataFrame) -> pd.DataFrame:
             if len(chosen):
                 ratios = 1.0 - chosen["improvement"].to_numpy(dtype=float)
                 drivers = chosen["driver"].astype(str).tolist()
-                one = statistics.improvement_statistics(np.ones_like(ratios), ratios, drivers)
-                numbers = (one.geometric, one.ci95_low, one.ci95_high, one.pairs)
+                improvement = statistics.improvement_statistics(
+                    np.ones_like(ratios), ratios, drivers
+                )
+                numbers = (
+                    improvement.geometric,
+                    improvement.ci95_low,
+                    improvement.ci95_high,
+                    improvement.pairs,
+                )
                 rows.append((str(base), amount, *numbers))
     return pd.DataFrame(rows, columns=["base", "amount", "geometric", "low", "high", "pairs"])
 
 
 def amounts_of(history: pd.DataFrame) -> list[str]:
-    """Returns the amounts of history in words, the smallest first; a share comes after seconds."""
+    """Returns the amounts of history as axis labels, the smallest first: "0 s", "10 s", "80 %".
+
+    The share of the trajectory stands last: it is all the history that there is.
+    """
     longest = history.groupby("amount")["history_s"].max()
     return sorted(
         (str(amount) for amount in longest.index),
@@ -64,7 +74,7 @@ def draw_history(history: pd.DataFrame) -> Figure:
     bases = curves["base"].unique()
     for k, base in enumerate(bases):
         curve = curves[curves["base"] == base]
-        aside = 0.06 * (k - 0.5 * (len(bases) - 1))
+        aside = 0.06 * (k - 0.5 * (len(bases) - 1))  # so that intervals do not hide each other
         places = np.array([amounts.index(amount) for amount in curve["amount"]]) + aside
         middle, low, high = curve[["geometric", "low", "high"]].to_numpy(dtype=float).T
         axes.errorbar(

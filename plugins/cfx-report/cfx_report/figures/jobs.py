@@ -55,12 +55,12 @@ class ClusterGroup:
 
 
 def statistics_axis(
-    found: Iterable[Improvement], baseline: str
+    improvements: Iterable[Improvement], baseline: str
 ) -> improvement_bars.ImprovementAxis:
     """Return the axis of several jobs' statistics."""
     values: list[float] = []
-    for one in found:
-        values += canvas.finite([getattr(one, name) for name in _SHOWN]).tolist()
+    for improvement in improvements:
+        values += canvas.finite([getattr(improvement, name) for name in _SHOWN]).tolist()
     what = "improvements, medians and ends of intervals"
     return improvement_bars.improvement_axis(np.array(values), baseline=baseline, what=what)
 
@@ -93,12 +93,12 @@ def error_limit(values: Mapping[str, canvas.Array], unit: str) -> tuple[float, s
 
 @canvas.styled
 def draw_overview(
-    found: Mapping[str, Improvement], baseline: str, axis: improvement_bars.ImprovementAxis
+    improvements: Mapping[str, Improvement], baseline: str, axis: improvement_bars.ImprovementAxis
 ) -> Figure:
     """Draws the improvement with its interval, that of the mean errors, and the median, by job."""
-    figure, axes, places = _by_job(list(found))
+    figure, axes, places = _by_job(list(improvements))
     colour = colours.colour_of(baseline)
-    for (job, row), place in zip(found.items(), places, strict=True):
+    for (job, row), place in zip(improvements.items(), places, strict=True):
         centre = row.geometric
         reach = np.nan_to_num([[centre - row.ci95_low], [row.ci95_high - centre]])
         drawn = axes.errorbar(
@@ -170,7 +170,7 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: improvement_bars.Improve
         colour = colours.JOB_COLOURS[k % len(colours.JOB_COLOURS)]
         handles.append(Patch(color=colour, label=wording.shortened(group.name, 60)))
         for place, cluster in enumerate(order):
-            inside = np.array([one == cluster for one in group.clusters], dtype=bool)
+            inside = np.asarray(group.clusters, dtype=object) == cluster
             values = canvas.finite(group.values[inside])
             if not len(values):
                 continue

@@ -33,10 +33,10 @@ def draw_models(
     rows = -(-len(shown) // across)
     figure = canvas.blank(0.4 + 3.3 * rows, 3.5 * across)
     grid = figure.subplots(rows, across, squeeze=False)
-    for place, one in enumerate(shown):
+    for place, comparison in enumerate(shown):
         axes = grid.flat[place]
-        both = errors[one.best].merge(
-            errors[one.other], on=["pair_id", "frames"], suffixes=("", "_other")
+        both = errors[comparison.best].merge(
+            errors[comparison.other], on=["pair_id", "frames"], suffixes=("", "_other")
         )
         best, other = both["error"].to_numpy(float), both["error_other"].to_numpy(float)
         end = 1.08 * float(np.nanmax(np.concatenate([best, other])))
@@ -45,15 +45,15 @@ def draw_models(
         axes.set_xlim(0, end)
         axes.set_ylim(0, end)
         axes.set_aspect("equal")
-        improvement = one.improvement
-        lead = f"{wording.percent(improvement.geometric, 1)} (p = {one.p_value:.2g})"
+        improvement = comparison.improvement
+        lead = f"{wording.percent(improvement.geometric, 1)} (p = {comparison.p_value:.2g})"
         note = headline.summaries_disagree(improvement.geometric, improvement.ratio_of_means)
         if note:
             lead += f"; {note}"
-        axes.set_title(f"{one.best} over {one.other}\n{lead}")
+        axes.set_title(f"{comparison.best} over {comparison.other}\n{lead}")
         unit = f" ({judge.unit})" if judge.unit else ""
-        axes.set_xlabel(canvas.wrapped(f"{judge.heading}, {one.best}{unit}"))
-        axes.set_ylabel(canvas.wrapped(f"{judge.heading}, {one.other}{unit}"))
+        axes.set_xlabel(canvas.wrapped(f"{judge.heading}, {comparison.best}{unit}"))
+        axes.set_ylabel(canvas.wrapped(f"{judge.heading}, {comparison.other}{unit}"))
     for unused in grid.flat[len(shown) :]:
         unused.set_visible(False)
     return figure

@@ -77,8 +77,8 @@ def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
     ordered = rows.sort_values(f"median_{axis.name}")
     number = np.arange(len(ordered))
     good = are_reliable(ordered).to_numpy(dtype=bool)
-    known = ordered[f"contraction_{axis.name}"].to_numpy(dtype=float) >= MIN_NARROWING
-    kinds = (good & known, good & ~known, ~good)
+    determined = ordered[f"contraction_{axis.name}"].to_numpy(dtype=float) >= MIN_NARROWING
+    kinds = (good & determined, good & ~determined, ~good)
     low, middle, high = (
         ordered[f"{kind}_{axis.name}"].to_numpy(dtype=float) for kind in ("low", "median", "high")
     )
@@ -99,7 +99,7 @@ def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
         for bound in (axis.low, axis.high):
             place.axhline(bound, color=colours.EDGE, linestyle="--", linewidth=1)
     place.set_xticks([])
-    share = int((good & known).sum())
+    share = int((good & determined).sum())
     place.set_title(f"{wording.unit_label(axis.name, axis.unit)}: {share} of {len(ordered)}")
 
 
@@ -280,13 +280,13 @@ class PosteriorPairs(JobFigure):
         if fits is None or draws is None or interval_rows(fits).empty:
             return None
         pair_id = _middle(interval_rows(fits))
-        own = draws[draws["pair_id"].astype(str) == pair_id]
+        of_pair = draws[draws["pair_id"].astype(str) == pair_id]
         axes = []
         for axis in result.parameters:
-            if f"parameter_{axis.name}" in own:
+            if f"parameter_{axis.name}" in of_pair:
                 axes.append(axis)
         prior = result.tables.get("population", result.tables.get("prior"))
-        return draw_pairs(pair_id, own, axes, prior) if len(own) and axes else None
+        return draw_pairs(pair_id, of_pair, axes, prior) if len(of_pair) and axes else None
 
 
 class PosteriorFan(JobFigure):
@@ -306,5 +306,5 @@ class PosteriorFan(JobFigure):
         if fits is None or fan is None or interval_rows(fits).empty:
             return None
         pair_id = _middle(interval_rows(fits))
-        own = fan[fan["pair_id"].astype(str) == pair_id]
-        return draw_fan(pair_id, own) if len(own) else None
+        of_pair = fan[fan["pair_id"].astype(str) == pair_id]
+        return draw_fan(pair_id, of_pair) if len(of_pair) else None

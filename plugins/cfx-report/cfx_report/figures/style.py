@@ -39,8 +39,8 @@ def draw_style(of_drivers: StyleResult) -> Figure:
 def _histogram(axes: Axes, of_drivers: StyleResult) -> None:
     scores = of_drivers.table["score"].to_numpy(dtype=float)
     clusters = of_drivers.table["cluster"].astype(float).astype(int).to_numpy()
-    known = canvas.finite(scores)
-    edges = score_bins(known)
+    measured = canvas.finite(scores)
+    edges = score_bins(measured)
     bottom = np.zeros(len(edges) - 1)
     for index, name in enumerate(style.CLUSTERS):
         mine = canvas.finite(scores[clusters == index])
@@ -57,7 +57,7 @@ def _histogram(axes: Axes, of_drivers: StyleResult) -> None:
             label=f"{name}: {len(mine)}",
         )
         bottom += counts
-    top = max(1, int(np.histogram(known, edges)[0].max()))
+    top = max(1, int(np.histogram(measured, edges)[0].max()))
     axes.set_ylim(0, 1.22 * top)
     for k, cut in enumerate(canvas.finite(of_drivers.cuts)):
         axes.axvline(cut, color=colours.INK, linestyle=(0, (4, 2)), linewidth=1.2)
@@ -66,8 +66,8 @@ def _histogram(axes: Axes, of_drivers: StyleResult) -> None:
     axes.yaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
     axes.grid(visible=False, axis="x")
     title = "style score (0 conservative, 1 aggressive)"
-    if len(scores) > len(known):
-        title += f"; {wording.plural(len(scores) - len(known), 'driver')} without a score"
+    if len(scores) > len(measured):
+        title += f"; {wording.plural(len(scores) - len(measured), 'driver')} without a score"
     axes.set_xlabel(title)
     axes.set_ylabel("drivers")
     axes.legend(

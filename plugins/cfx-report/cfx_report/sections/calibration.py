@@ -56,12 +56,12 @@ class CalibrationSection(Section):
             spreads = spreads_of(job)
             if spreads:
                 together.setdefault(_fingerprint(spreads), []).append(job)
-        found = []
+        calibrations = []
         for jobs in together.values():
             table = sheet(spreads_of(jobs[0]), slices_of(jobs[0]))
             about = {"names": job_names(jobs), "job": jobs[0], "sheet": table}
-            found.append({**about, "labels": _labels(jobs)})
-        return {"calibrations": found} if found else None
+            calibrations.append({**about, "labels": _labels(jobs)})
+        return {"calibrations": calibrations} if calibrations else None
 
 
 def _labels(jobs: Sequence[Result]) -> dict[str, View]:
@@ -91,12 +91,12 @@ def spreads_of(job: Result) -> tuple[parameter_spread.ParameterSpread, ...]:
 
 
 def _fingerprint(spreads: tuple[parameter_spread.ParameterSpread, ...]) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for spread in spreads:
-        found.update(spread.axis.name.encode())
-        found.update(spread.values.tobytes())
-        found.update(spread.pooled.tobytes())
-    return found.hexdigest()
+        digest.update(spread.axis.name.encode())
+        digest.update(spread.values.tobytes())
+        digest.update(spread.pooled.tobytes())
+    return digest.hexdigest()
 
 
 class _Row(NamedTuple):
@@ -120,7 +120,9 @@ def sheet(
     """Returns a row per parameter."""
     examined = {panel.axis.name: (panel.near, panel.flat) for panel in panels}
     unknown = (np.nan, np.nan)
-    return Sheet.of(_COLUMNS, [_Row(one, *examined.get(one.axis.name, unknown)) for one in spreads])
+    return Sheet.of(
+        _COLUMNS, [_Row(spread, *examined.get(spread.axis.name, unknown)) for spread in spreads]
+    )
 
 
 def _name(row: _Row) -> Cell:

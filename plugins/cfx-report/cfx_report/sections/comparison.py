@@ -220,11 +220,13 @@ def safety(jobs: Sequence[Result]) -> Sheet:
 
 def every_metric(jobs: Sequence[Result]) -> Sheet | None:
     """Returns a row per job with all metrics of the test part; None if no job lists its metrics."""
-    known: dict[str, MetricInfo] = {}
+    metrics: dict[str, MetricInfo] = {}
     for job in jobs:
-        known |= {one.name: one for one in job.known_metrics if wording.TEST in one.scopes}
+        for metric in job.known_metrics:
+            if wording.TEST in metric.scopes:
+                metrics[metric.name] = metric
     columns = [_JOB]
-    for metric in known.values():
+    for metric in metrics.values():
         better = "" if metric.direction == "none" else f" The {metric.direction} the better."
         meaning = f"{metric.meaning}, {metric.summary} over pairs.{better}"
         cell = partial(
@@ -235,7 +237,7 @@ def every_metric(jobs: Sequence[Result]) -> Sheet | None:
             form=".3g",
         )
         columns.append(Column(metric_title(metric), cell, meaning))
-    return Sheet.of(columns, jobs) if known else None
+    return Sheet.of(columns, jobs) if metrics else None
 
 
 def absolute(jobs: Sequence[Result]) -> dict[str, View]:
@@ -362,11 +364,11 @@ def _gain_over_seeds(row: Row, baseline: str) -> Cell:
 
 def _mean_and_range(values: np.ndarray, form: str) -> Cell:
     """Returns the mean, and below it the least and the largest value, where they differ."""
-    known = canvas.finite(values)
-    if not len(known):
+    measured = canvas.finite(values)
+    if not len(measured):
         return number(np.nan, form)
     ends = []
-    for end in (known.min(), known.max()):
+    for end in (measured.min(), measured.max()):
         ends.append(formatted(float(end), form).removesuffix(" %"))
     second = " to ".join(ends) if len(set(ends)) > 1 else ""
-    return number(float(known.mean()), form, second)
+    return number(float(measured.mean()), form, second)

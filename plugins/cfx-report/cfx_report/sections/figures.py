@@ -57,11 +57,12 @@ class StyleSection(Section):
                 scoring = hashlib.sha256(table.encode()).hexdigest()
                 jobs.setdefault(scoring, []).append(job)
         named = len(jobs) > 1
-        scorings = [(job_names(one) if named else "", "", one[0]) for one in jobs.values()]
-        by_site = []
-        for one in scorings:
-            if "style_distances" in one[2].tables:
-                by_site.append(one)
+        scorings, by_site = [], []
+        for alike in jobs.values():
+            names = job_names(alike) if named else ""
+            scorings.append((names, "", alike[0]))
+            if "style_distances" in alike[0].tables:
+                by_site.append((names, "", alike[0]))
         rows: list[dict[str, Any]] = []
         for name, _, job in by_site:
             for row in job.tables["style_distances"].to_dict("records"):
@@ -145,8 +146,8 @@ class HistorySection(Section):
         jobs = [job for job in runs.jobs if "history" in job.tables]
         rows: list[dict[str, Any]] = []
         for job in jobs:
-            for one in history_curves(job.tables["history"]).to_dict("records"):
-                rows.append({"job": job.name, **{str(key): one[key] for key in one}})
+            for amount in history_curves(job.tables["history"]).to_dict("records"):
+                rows.append({"job": job.name, **{str(key): amount[key] for key in amount}})
         varied = [(job.name, "", job) for job in jobs]
         return {"varied": varied, "amounts": Sheet.of(_AMOUNTS, rows)} if jobs else None
 

@@ -61,7 +61,7 @@ def _keyed(job: Result, jobs: Sequence[Result]) -> pd.DataFrame:
     """Returns the job's pairs with a key that is the same for the same pair of another job."""
     table = job.by_pair.copy()
     keys = table["pair_id"].astype(str)
-    if len({str(one.data.get("source", "")) for one in jobs}) > 1:
+    if len({str(other.data.get("source", "")) for other in jobs}) > 1:
         keys = keys + f" ({job_folder.without_folders(str(job.data.get('source', '')))})"
     table["key"] = keys
     return table
@@ -160,14 +160,14 @@ def cluster_series(jobs: Sequence[Result]) -> dict[str, dict[str, pd.DataFrame]]
     series: dict[str, dict[str, pd.DataFrame]] = {}
     parts = differences(jobs, ignored=("style.cluster",))
     for job, family in zip(jobs, parts, strict=True):
-        found = _by_cluster(job.by_pair)
+        clusters = _by_cluster(job.by_pair)
         name = job.name
         if job.setting("style.cluster") not in {None, "all"}:
             together = f"{SEPARATOR.join(family)}, a job for each cluster"
             # The same cluster twice: the jobs differ in nothing that has a name.
-            if not set(found) & set(series.get(together, {})):
+            if not set(clusters) & set(series.get(together, {})):
                 name = together
-        series.setdefault(name, {}).update(found)
+        series.setdefault(name, {}).update(clusters)
     ordered = {}
     for name, by_cluster in series.items():
         ordered[name] = {c: by_cluster[c] for c in style.CLUSTERS if c in by_cluster}
@@ -175,12 +175,12 @@ def cluster_series(jobs: Sequence[Result]) -> dict[str, dict[str, pd.DataFrame]]
 
 
 def _by_cluster(table: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    found = {}
+    by_cluster = {}
     for cluster in style.CLUSTERS:
         rows = table[table["cluster"] == cluster]
         if len(rows):
-            found[cluster] = rows
-    return found
+            by_cluster[cluster] = rows
+    return by_cluster
 
 
 def per_cluster(series: Series, baselines: Sequence[str]) -> dict[str, View]:

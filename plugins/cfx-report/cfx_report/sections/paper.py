@@ -39,7 +39,7 @@ class PaperSection(Section):
     def context(self, runs: Runs) -> Mapping[str, Any] | None:
         """Return a comparison for each of the paper's experiments among the jobs."""
         paper = published()
-        found = []
+        experiments = []
         for experiment, about in paper["experiments"].items():
             jobs = []
             for job in runs.jobs:
@@ -48,7 +48,7 @@ class PaperSection(Section):
             if "ranked" in about:
                 jobs = _ranked(jobs, about["ranked"])
             if jobs:
-                found.append(
+                experiments.append(
                     {
                         "heading": about["heading"],
                         "sheet": comparison(about, jobs),
@@ -56,26 +56,26 @@ class PaperSection(Section):
                         "differences": differences(paper, about, jobs),
                     }
                 )
-        return {"paper": paper, "experiments": found} if found else None
+        return {"paper": paper, "experiments": experiments} if experiments else None
 
 
 def published() -> dict[str, Any]:
     """Return what `published.json` holds."""
     file = resources.files("cfx_report.sections") / "published.json"
-    found: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
-    return found
+    figures: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    return figures
 
 
 def comparison(about: Mapping[str, Any], jobs: Sequence[Result]) -> Sheet:
     """Return the paper's rows of an experiment, and a row per job; names stand first."""
     rows = [("paper", *row) for row in about["published"]]
     for job in jobs:
-        values = [value_of(job, one["value"]) for one in about["columns"]]
+        values = [value_of(job, column["value"]) for column in about["columns"]]
         rows.append((f"here: {job.name}", *values))
     columns = [Column[Sequence[Any]]("", itemgetter(0))]
-    for place, one in enumerate(about["columns"], start=1):
-        cell = partial(_cell, place, one.get("form", ""))
-        columns.append(Column(one["heading"], cell, one.get("meaning", "")))
+    for place, column in enumerate(about["columns"], start=1):
+        cell = partial(_cell, place, column.get("form", ""))
+        columns.append(Column(column["heading"], cell, column.get("meaning", "")))
     return Sheet.of(columns, rows)
 
 
@@ -115,10 +115,10 @@ def verdicts(about: Mapping[str, Any], jobs: Sequence[Result]) -> list[str]:
         gains = {job.name: float(value_of(job, about["judged"])) for job in jobs}
         for name, gain in gains.items():
             said.append(f"{name}: mean of the ratios {wording.percent_or_undefined(gain, 1)}.")
-        known = [gain for gain in gains.values() if math.isfinite(gain)]
-        if len(known) > 1:
-            above = sum(gain > 0 for gain in known)
-            said.append(f"Above 0 % in {above} of {len(known)} jobs here.")
+        measured = [gain for gain in gains.values() if math.isfinite(gain)]
+        if len(measured) > 1:
+            above = sum(gain > 0 for gain in measured)
+            said.append(f"Above 0 % in {above} of {len(measured)} jobs here.")
     if "ranked" in about and math.isfinite(value_of(jobs[0], about["ranked"])):
         said.append(f"The smallest of the last column here: {jobs[0].name}.")
     for better in about.get("better", ()):
@@ -145,9 +145,11 @@ def _compared(better: Mapping[str, str], judged: str, jobs: Sequence[Result]) ->
             alike = gains.setdefault(str(value_of(job, better["same"])), {})
             alike[str(value_of(job, better["value"]))] = gain
     said = []
-    for same, found in gains.items():
-        if {better["with"], better["than"]} <= set(found):
-            more = "better" if found[better["with"]] > found[better["than"]] else "no better"
+    for same, improvements in gains.items():
+        if {better["with"], better["than"]} <= set(improvements):
+            more = "no better"
+            if improvements[better["with"]] > improvements[better["than"]]:
+                more = "better"
             said.append(
                 f"{same}: the policy fares {more} with {better['with']} than with {better['than']}"
                 " here; better in the paper."
@@ -163,10 +165,12 @@ def differences(paper: Mapping[str, Any], about: Mapping[str, Any], jobs: Sequen
         number_of = {"what": "the number of pairs", "value": "pairs", "there": f"{pairs} in all"}
         listed.insert(1, {**number_of, "same": str(pairs)})
     parts = []
-    for one in listed:
-        here = sorted({str(value_of(job, one["value"])) for job in jobs} - {""})
-        if here and here != [one["same"]]:
-            parts.append(f"{one['what']} (here {' or '.join(here)}; there {one['there']})")
+    for condition in listed:
+        here = sorted({str(value_of(job, condition["value"])) for job in jobs} - {""})
+        if here and here != [condition["same"]]:
+            parts.append(
+                f"{condition['what']} (here {' or '.join(here)}; there {condition['there']})"
+            )
     told = "; ".join([*parts, paper["unknown"]])
     return f"The numbers need not agree, because these things differ, or may: {told}."
 

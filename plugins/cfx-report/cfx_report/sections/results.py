@@ -68,12 +68,12 @@ def overview(jobs: Sequence[Result]) -> dict[str, View]:
     for scope in SCOPES:
         suffix = "" if scope == wording.TEST else f", {jobs[0].scope_label(scope)}"
         for baseline in any_baselines(jobs, scope):
-            found = {}
+            improvements = {}
             for job in jobs:
                 if baseline in job.baselines(scope):
-                    found[job.name] = job.statistics(baseline, scope)
-            axis = statistics_axis(found.values(), baseline)
-            drawn = draw_overview(found, baseline, axis)
+                    improvements[job.name] = job.statistics(baseline, scope)
+            axis = statistics_axis(improvements.values(), baseline)
+            drawn = draw_overview(improvements, baseline, axis)
             views[f"against {wording.method_label(baseline)}{suffix}"] = View(drawn, axis.note)
     return views
 
@@ -202,8 +202,8 @@ def improvements(jobs: Sequence[Result]) -> Sheet:
         for baseline in dict.fromkeys(baselines):
             for job in jobs:
                 if baseline in job.baselines(scope):
-                    found = job.statistics(baseline, scope)
-                    rows.append(_Compared(job.name, baseline, scope, found))
+                    improvement = job.statistics(baseline, scope)
+                    rows.append(_Compared(job.name, baseline, scope, improvement))
     columns = [
         Column[_Compared]("Job", lambda row: row.job),
         Column(

@@ -42,7 +42,7 @@ class RunSection(Section):
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return what all jobs share, and a table of what they do not."""
         unfinished = [
-            (job_folder.without_folders(one.place), one.reason) for one in runs.unfinished
+            (job_folder.without_folders(job.place), job.reason) for job in runs.unfinished
         ]
         common, differing = facts(runs.jobs)
         return {"unfinished": unfinished, "common": common, "differing": differing}
@@ -66,10 +66,12 @@ class ConfigurationsSection(Section):
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return the place and the configuration of each job."""
-        found = []
+        configurations = []
         for job in runs.jobs:
-            found.append((job.name, job_folder.without_folders(job.place), _configuration(job)))
-        return {"configurations": found}
+            configurations.append(
+                (job.name, job_folder.without_folders(job.place), _configuration(job))
+            )
+        return {"configurations": configurations}
 
 
 def _configuration(job: Result) -> str:
@@ -88,9 +90,9 @@ def facts(jobs: Sequence[Result]) -> tuple[list[tuple[str, str]], Sheet | None]:
     rows = []
     names: dict[str, None] = {}
     for job in jobs:
-        found = _facts(job, jobs)
-        rows.append({"Job": job.name, **found})
-        names |= dict.fromkeys(found)
+        of_job = _facts(job, jobs)
+        rows.append({"Job": job.name, **of_job})
+        names |= dict.fromkeys(of_job)
     common = []
     columns = [Column[Mapping[str, str]]("Job", itemgetter("Job"))]
     for name in names:
@@ -119,14 +121,14 @@ def duration(seconds: float | None) -> str:
 
 def _facts(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
     table = job.pairs.drop_duplicates("pair_id")
-    found = {
+    facts = {
         "Started": f"{job.started:%Y-%m-%d %H:%M}" if job.started else "not recorded",
         "Took": duration(job.seconds),
         **_typed(job, jobs),
     }
     if job.setting("preset"):
-        found["Preset"] = job.setting("preset")
-    return found | {
+        facts["Preset"] = job.setting("preset")
+    return facts | {
         "Data": job_folder.without_folders(
             str(job.data.get("source") or job.component("data") or wording.NOTHING)
         ),
@@ -154,9 +156,9 @@ def _calibration(job: Result) -> str:
 
 def _left_out(job: Result) -> str:
     parts = []
-    for one in job.data.get("dropped") or ():
-        if isinstance(one, Mapping):
-            parts.append(f"{one.get('count')} {one.get('unit')} ({one.get('reason')})")
+    for dropped in job.data.get("dropped") or ():
+        if isinstance(dropped, Mapping):
+            parts.append(f"{dropped.get('count')} {dropped.get('unit')} ({dropped.get('reason')})")
     return "; ".join(parts) or "nothing"
 
 
@@ -167,13 +169,13 @@ def _typed(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
     if len(jobs) == 1:
         return {"Command": _command(job.overrides)}
     shared = _shared_overrides(jobs)
-    own = []
+    of_job = []
     for override in job.overrides:
         if override not in shared:
-            own.append(override)
+            of_job.append(override)
     return {
         "Command": f"{_command(shared)} …",
-        "Overrides of its own": job_folder.without_folders(shlex.join(own)) or "none",
+        "Overrides of its own": job_folder.without_folders(shlex.join(of_job)) or "none",
     }
 
 
@@ -184,13 +186,13 @@ def _command(overrides: Sequence[str]) -> str:
 
 def _shared_overrides(jobs: Sequence[Result]) -> list[str]:
     """Returns the overrides that all jobs with known overrides have, in order."""
-    known = []
+    typed = []
     for job in jobs:
         if job.overrides is not None:
-            known.append(job.overrides)
+            typed.append(job.overrides)
     shared = []
-    for override in known[0]:
-        if all(override in other for other in known):
+    for override in typed[0]:
+        if all(override in other for other in typed):
             shared.append(override)
     return shared
 
