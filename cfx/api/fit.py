@@ -260,9 +260,10 @@ class Fit:
         """Draws the parameters between their bounds, and how they go together."""
         from cfx.results.result import Result, described_parameters
 
-        tables = [
-            self._of(method).add_prefix("parameter_").assign(method=method) for method in METHODS
-        ]
+        tables = []
+        for method in METHODS:
+            parameters = self._of(method).add_prefix("parameter_")
+            tables.append(parameters.assign(method=method))
         rows = pd.concat(tables, ignore_index=True)
         described = {"parameters": described_parameters(self._context.space.tuned)}
         return Result(data=described, tables={"pairs": rows}).plot("calibration")
@@ -369,7 +370,9 @@ class Fit:
             name = f"{part}_{metric}"
             if name in self.losses:
                 means = self.losses.groupby("method")[name].mean()
-                errors = [f"{short_label(method)} {means[method]:.3f}" for method in METHODS]
+                errors = []
+                for method in METHODS:
+                    errors.append(f"{short_label(method)} {means[method]:.3f}")
                 heading, unit = ERRORS[metric]
                 lines.append(f"{heading}, {unit}: {', '.join(errors)}")
         few = self.losses["driver"].nunique()

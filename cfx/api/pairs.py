@@ -232,10 +232,14 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
         values = {key: value for key, value in node.items() if key != "name"}
         made = validate(TidySettings, values, where="data")
         return Pairs(FrameDataset(made, frame).load(), node)
-    paths = [source] if isinstance(source, str | Path) else _paths(source)
-    paths = [path if is_url(str(path)) else str(absolute(path)) for path in paths]
+    paths = []
+    for path in [source] if isinstance(source, str | Path) else _paths(source):
+        if is_url(str(path)):
+            paths.append(str(path))
+        else:
+            paths.append(str(absolute(path)))
     own_columns = {"columns", "units"} & settings.keys()
-    name = dataset or ("tidy" if own_columns else dataset_of(Path(str(paths[0]))))
+    name = dataset or ("tidy" if own_columns else dataset_of(Path(paths[0])))
     overrides["data.path"] = paths[0] if len(paths) == 1 else paths
     return Pairs.of(config_of({"data": name, **overrides}).data)
 

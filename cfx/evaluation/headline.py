@@ -210,7 +210,10 @@ def _error_said(heading: str, unit: str, measured: Mapping[str, float], baseline
 
 def _constant_sets(measured: Mapping[str, float], methods: Iterable[str], unit: str) -> str:
     """Returns the errors of sets of constant parameters in words."""
-    return ", ".join(f"{_CONSTANT[method]} {measured[method]:.3f}{unit}" for method in methods)
+    errors = []
+    for method in methods:
+        errors.append(f"{_CONSTANT[method]} {measured[method]:.3f}{unit}")
+    return ", ".join(errors)
 
 
 def fitted_errors(errors: Mapping[str, float]) -> dict[str, float]:

@@ -328,9 +328,11 @@ def ranking_of(
     if not groups:
         return Ranking((), (), 0, (), ())
     tested, names = max(groups.items(), key=lambda group: len(group[1]))
-    columns = {name: tables[name].set_index("pair_id")["error"] for name in names}
     drivers = tables[names[0]].set_index("pair_id")["driver"].astype(str)
-    aligned = {name: column.reindex(drivers.index) for name, column in columns.items()}
+    aligned = {}
+    for name in names:
+        errors_of_pairs = tables[name].set_index("pair_id")["error"]
+        aligned[name] = errors_of_pairs.reindex(drivers.index)
     of_pair = None if sites is None else [sites[pair_id] for pair_id in drivers.index]
     means = {}
     for name, column in aligned.items():

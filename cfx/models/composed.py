@@ -136,10 +136,11 @@ class Combined(Composed):
     reference = "the weighted mean of two models"
 
     def __init__(self, first: DrivingModel, second: DrivingModel) -> None:
-        renamed = tuple(
-            replace(parameter, name=f"{PREFIX}{parameter.name}") for parameter in second.space
-        )
-        super().__init__(first, (*renamed, WEIGHT), second.memory_size)
+        # The two models may share names of parameters.
+        added = []
+        for parameter in second.space:
+            added.append(replace(parameter, name=f"{PREFIX}{parameter.name}"))
+        super().__init__(first, (*added, WEIGHT), second.memory_size)
         self.second = second
 
     def identity(self) -> dict[str, Any]:
@@ -177,9 +178,11 @@ class Combined(Composed):
 
 def of_second(p: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Returns the second model's parameters under its own names."""
-    return {
-        name.removeprefix(PREFIX): value for name, value in p.items() if name.startswith(PREFIX)
-    }
+    parameters = {}
+    for name, value in p.items():
+        if name.startswith(PREFIX):
+            parameters[name.removeprefix(PREFIX)] = value
+    return parameters
 
 
 def for_both(

@@ -91,9 +91,10 @@ class RecurrentNetwork(PolicyNetwork):
         count = self.gates * self.hidden * (features + self.hidden) * settings.layers * networks
         require_memory(_BYTES * count, f"policy.hidden_size={self.hidden}")
         widths = [features, *[settings.hidden_size] * (settings.layers - 1)]
-        self.layers = nn.ModuleList(
-            RecurrentLayer(networks, width, self.hidden, self.gates, generator) for width in widths
-        )
+        self.layers = nn.ModuleList()
+        for width in widths:
+            layer = RecurrentLayer(networks, width, self.hidden, self.gates, generator)
+            self.layers.append(layer)
         self.dropout = nn.Dropout(settings.dropout)
         weights = _uniform((networks, self.hidden, parameters), self.hidden, generator)
         if settings.start == "fixed":

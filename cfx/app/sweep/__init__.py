@@ -89,9 +89,10 @@ class Sweep:
         with contextlib.suppress(OmegaConfBaseException, ValueError), resolving(copied):
             tracking = OmegaConf.to_container(config.tracking, resolve=True)
         of_hydra: Any = OmegaConf.to_container(config.hydra.overrides.hydra, resolve=False)
-        overrides = [
-            override for override in of_hydra if not override.startswith("hydra.sweep.dir=")
-        ]
+        overrides = []
+        for override in of_hydra:
+            if not override.startswith("hydra.sweep.dir="):
+                overrides.append(override)
         escaped = str(folder).replace("'", "\\'")
         with read_write(config.hydra), open_dict(config.hydra):
             config.hydra.sweep.dir = str(folder)

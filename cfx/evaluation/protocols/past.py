@@ -174,10 +174,8 @@ def expected_of_unseen(
     """
     if not {"policy", "pooled"} <= set(speed):
         return expected
-    policy, constant = (
-        conformal_bound(speed[method].to_numpy(dtype=np.float64), fold)
-        for method in ("policy", "pooled")
-    )
+    policy = conformal_bound(speed["policy"].to_numpy(dtype=np.float64), fold)
+    constant = conformal_bound(speed["pooled"].to_numpy(dtype=np.float64), fold)
     return replace(expected, unseen=policy, unseen_constant=constant)
 
 
