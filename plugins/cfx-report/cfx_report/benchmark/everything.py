@@ -19,7 +19,7 @@ _CONSTANTS = ("idm", "gipps", "ovm", "fvdm", "newell", "w99", "krauss")
 _POLICIES = (
     ("model=idm", "--method", "closed_loop"),
     ("model=krauss", "--method", "closed_loop"),
-    ("experiment=every_road", "learner.ensemble_size=1"),
+    ("experiment=every_road", "protocol.history=null"),
 )
 
 _SEEDS = (0, 1)

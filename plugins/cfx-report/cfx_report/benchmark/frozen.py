@@ -65,6 +65,10 @@ FROZEN_KEYS = (
 )
 """Keys of a job's configuration that are the benchmark's alone."""
 
+HISTORY = "protocol.history"
+"""What a policy learns to read of a driver, which a method may choose: how much it is given is the
+benchmark's."""
+
 
 def protocol_hash(data: str = DATA) -> str:
     """Returns what names the protocol: twelve digits of the SHA-256 of everything fixed here.

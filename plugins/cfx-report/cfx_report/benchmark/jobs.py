@@ -10,7 +10,7 @@ from pathlib import Path
 
 from cfx.errors import ConfigError, DataError, Terminated, nearest
 from cfx.plugin import files
-from cfx_report.benchmark.frozen import FROZEN_KEYS, METHODS
+from cfx_report.benchmark.frozen import FROZEN_KEYS, HISTORY, METHODS
 
 _CHANGE_NOTHING = (
     "tracking",
@@ -77,7 +77,7 @@ def require_free(overrides: Sequence[str]) -> None:
     """Raises ConfigError for an override of what is frozen."""
     for one in overrides:
         key = one.partition("=")[0].lstrip("+~")
-        if key.split(".")[0].split("@")[0] in FROZEN_KEYS:
+        if key != HISTORY and key.split(".")[0].split("@")[0] in FROZEN_KEYS:
             raise ConfigError(
                 f"cfx benchmark: {one}: pairs, folds, seed, split, windows and metrics are the"
                 " benchmark's; without them rows do not compare. A job of your own: python -m cfx"

@@ -37,6 +37,7 @@ from cfx.plugin import (
     registry,
     simulate_follower,
 )
+from cfx_report.benchmark.frozen import HISTORY
 from cfx_report.benchmark.jobs import run_job
 from cfx_report.benchmark.rival import Driver, Rival, on_frames
 from cfx_report.benchmark.suite import Scheme, Suite
@@ -182,10 +183,14 @@ class JobEntry(Entry):
         scheme = training.scheme
         job = training.folder / "jobs" / scheme.name
         folds = "null" if scheme.folds is None else str(scheme.folds)
+        shortest = training.suite.min_test_duration
+        history = [word for word in self.overrides if word.startswith(f"{HISTORY}=")]
         overrides = [
             *self.overrides,
             *training.suite.job,
-            "protocol.combine=false",  # it needs history, which a suite gives after the job
+            f"protocol.min_test_duration={'null' if shortest is None else f'{shortest:g}'}",
+            "protocol.combine=false",
+            *history,
             f"protocol.together={scheme.together}",
             f"protocol.folds={folds}",
             f"seed={training.seed}",
@@ -225,18 +230,6 @@ class AgentDriver(Driver):
     def _is_constant(self) -> bool:
         return isinstance(self.agent.core.policy, FixedPolicy)
 
-    @property
-    def _history_s(self) -> float | None:
-        """How much measured history the policy reads, s; None: all there is.
-
-        A policy that is conditioned on driver features has learned to read; one that learned from
-        cold starts alone has not (it errs more after it has read, by 1 % in `known`), and does
-        what it does in its job.
-        """
-        if self.agent.core.driver_features:
-            return None
-        return self.agent.context_rule.history_s
-
     def drive(self, batch: PairBatch, first: Tensor, seed: int | None) -> Tensor:
         if self._own is not None and self._is_constant:
             return self._with_own(batch, first)
@@ -244,7 +237,9 @@ class AgentDriver(Driver):
         if self._own is not None:
             base = base_of(self.agent, self._own)
         network = torch.full_like(first, self.number)
-        followers = Followers(batch, network, base, self._history_s)
+        # A policy reads as much of the past as it has learned to. Those that learned from cold
+        # starts alone err more after they have read, by 1 % in the suite's task `known`.
+        followers = Followers(batch, network, base, self.agent.context_rule.history_s)
         generator = None
         if seed is not None and self.is_stochastic:
             generator = torch.Generator().manual_seed(seed)
