@@ -90,8 +90,12 @@ def at_limits(limits: LimitSettings | None, speed: Tensor, dt: float) -> Tensor:
     is_at_limit = torch.zeros_like(speed, dtype=torch.bool)
     if limits is None:
         return is_at_limit
-    acceleration = speed.diff(dim=-1) / dt
-    is_at_limit[..., 1:] = (acceleration >= limits.acceleration - _AT) | (
+    is_at_limit[..., 1:] = at_limit(limits, speed.diff(dim=-1) / dt)
+    return is_at_limit
+
+
+def at_limit(limits: LimitSettings, acceleration: Tensor) -> Tensor:
+    """Says which accelerations `(*batch,)`, m/s2, are at a limit, bool `(*batch,)`."""
+    return (acceleration >= limits.acceleration - _AT) | (
         acceleration <= -limits.emergency_deceleration + _AT
     )
-    return is_at_limit

@@ -5,7 +5,9 @@ Shapes: D vehicles.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.plugin import (
@@ -14,12 +16,19 @@ from cfx.plugin import (
     Follower,
     Leader,
     LimitSettings,
+    RowFunction,
+    Rows,
     advance_vehicle,
-    at_limits,
+    at_limit,
+    folder_hash,
+    row_function,
+    step_key,
 )
 from cfx_sumo.live.braking import hardest_braking
 from cfx_sumo.live.surroundings import Connection, Seen
 from cfx_sumo.live.vehicles import KnownVehicles
+
+_Floats = NDArray[np.float64]
 
 
 class ModelSteps:
@@ -37,9 +46,10 @@ class ModelSteps:
     ) -> None:
         self._space = policy.space
         self._driven = policy.core.head.driven_model(model)
-        self._model = model
         self._vehicles = vehicles
-        self._bounds_braking = bounds_braking
+        self._limits = model.limits
+        self._bounded_by = model.limits if bounds_braking else None
+        self._proposals: dict[float, RowFunction] = {}
 
     def begin(self, row: int, speed: Tensor) -> None:
         """Begins the model's memory of a vehicle that drives at `speed`, `()`, m/s."""
@@ -62,56 +72,98 @@ class ModelSteps:
             0 where comfortably is enough.
         """
         table = self._vehicles.table
-        follower = Follower(
-            torch.zeros_like(seen.speed), seen.speed, seen.acceleration, table.memory[rows]
-        )
-        zero = torch.zeros_like(seen.gap)
-        leader = Leader(seen.gap, seen.leader_speed, seen.leader_acceleration, zero)
-        p = self._space.unpack(table.parameters[rows])
-        after = advance_vehicle(self._driven, follower, leader, p, dt)
-        table.memory[rows] = after.memory
-        speed, bound = after.speed, torch.zeros_like(seen.speed)
-        limits = self._model.limits
-        if limits is not None and self._bounds_braking:
-            speed, bound = _comfortable(connection, names, seen, speed, limits, dt)
-        return torch.minimum(speed, _allowed(connection, names, seen, dt)), bound
+        proposed, hardest = torch.empty((2, len(rows)), dtype=torch.float64).unbind()
+        memory = Rows(table.memory, rows)
+        inputs = [*map(Rows, seen), Rows(table.parameters, rows), memory]
+        outputs = [Rows(proposed), Rows(hardest), memory]
+        self._proposal(dt)(len(rows), inputs, outputs)
+        speed, bound = proposed.numpy(), np.zeros(len(rows))
+        if self._bounded_by is not None:
+            speed, bound = _comfortable(
+                connection, names, seen, speed, hardest.numpy(), self._bounded_by, dt
+            )
+        speed = np.minimum(speed, _allowed(connection, names, seen, dt))
+        return torch.from_numpy(speed), torch.from_numpy(bound)
 
     def count_limited(self, before: Tensor, after: Tensor, dt: float) -> int:
         """Returns how many vehicles are at a limit of acceleration, of speeds `(D,)` in m/s."""
-        speeds = torch.stack([before, after], -1)
-        return int(at_limits(self._model.limits, speeds, dt)[:, 1].sum())
+        if self._limits is None:
+            return 0
+        return int(at_limit(self._limits, (after - before) / dt).sum())
+
+    def _proposal(self, dt: float) -> RowFunction:
+        """Returns the model's step of `dt` seconds as a function of vehicles' rows.
+
+        It takes the signals of `Seen`, parameters and the model's memory. It gives the next speeds,
+        how hard vehicles may brake now, and the memory afterwards.
+        """
+        if dt in self._proposals:
+            return self._proposals[dt]
+        driven, space, bounded_by = self._driven, self._space, self._bounded_by
+
+        def propose(*values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+            *signals, parameters, memory = values
+            seen = Seen(*(signal[:, 0] for signal in signals))
+            zero = torch.zeros_like(seen.gap)
+            follower = Follower(zero, seen.speed, seen.acceleration, memory)
+            leader = Leader(seen.gap, seen.leader_speed, seen.leader_acceleration, zero)
+            after = advance_vehicle(driven, follower, leader, space.unpack(parameters), dt)
+            hardest = zero
+            if bounded_by is not None:
+                hardest = hardest_braking(seen, bounded_by)
+            return after.speed[:, None], hardest[:, None], after.memory
+
+        key = step_key(driven)
+        if key is not None:
+            bounds = None if bounded_by is None else bounded_by.model_dump()
+            key = [key, [repr(parameter) for parameter in space], bounds, dt, folder_hash(__file__)]
+        widths = [1] * len(Seen._fields) + [len(space), driven.memory_size]
+        self._proposals[dt] = row_function(propose, widths, key)
+        return self._proposals[dt]
 
 
 def _comfortable(
     connection: Connection,
     names: list[str],
     seen: Seen,
-    speed: Tensor,
+    speed: _Floats,
+    hardest: _Floats,
     limits: LimitSettings,
     dt: float,
-) -> tuple[Tensor, Tensor]:
+) -> tuple[_Floats, _Floats]:
     """Raises speeds `(D,)` so that vehicles brake comfortably, unless their `minGap` needs more.
+
+    Args:
+        connection: to the simulation.
+        names: the vehicles.
+        seen: what they do.
+        speed: proposed, `(D,)`, m/s.
+        hardest: how hard they may brake now, `(D,)`, m/s2; bounded by their `emergencyDecel`.
+        limits: of the model.
+        dt: the step, s.
 
     Returns:
         The speeds `(D,)`, m/s; and how hard vehicles must be able to brake, `(D,)`, m/s2, 0 where
         comfortably is enough.
     """
-    hardest = hardest_braking(seen, limits)
-    beyond = hardest > limits.comfortable_deceleration
-    for index in beyond.nonzero().flatten().tolist():
+    comfortable = limits.comfortable_deceleration
+    for index in np.flatnonzero(hardest > comfortable).tolist():
         emergency = connection.vehicle.getEmergencyDecel(names[index])
         hardest[index] = min(float(hardest[index]), emergency)
-    speed = torch.maximum(speed, (seen.speed - hardest * dt).clamp(min=0.0))
-    return speed, torch.where(hardest > limits.comfortable_deceleration, hardest, 0.0)
+    slowest = np.maximum(seen.speed.numpy() - hardest * dt, 0.0)
+    return np.maximum(speed, slowest), np.where(hardest > comfortable, hardest, 0.0)
 
 
-def _allowed(connection: Connection, names: list[str], seen: Seen, dt: float) -> Tensor:
+def _allowed(connection: Connection, names: list[str], seen: Seen, dt: float) -> _Floats:
     """Returns the highest speeds that limits leave, `(D,)`, m/s.
 
     For a limit no vehicle brakes harder than its `decel`.
     """
-    highest = seen.allowed.clone()
-    for index in (seen.speed > seen.allowed).nonzero().flatten().tolist():
-        slowest = seen.speed[index] - connection.vehicle.getDecel(names[index]) * dt
+    speed, highest = seen.speed.numpy(), seen.allowed.numpy()
+    too_fast = np.flatnonzero(speed > highest).tolist()
+    if too_fast:
+        highest = highest.copy()
+    for index in too_fast:
+        slowest = speed[index] - connection.vehicle.getDecel(names[index]) * dt
         highest[index] = max(highest[index], slowest)
     return highest
