@@ -163,6 +163,7 @@ from .policies.known_drivers import (
     base_of as base_of,
     driver_features_of as driver_features_of,
 )
+from .policies.row_choice import DriverRows as DriverRows, RowChoice as RowChoice
 from .policies.ready import READY_FOLDER as READY_FOLDER, traffic_table as traffic_table
 
 # Learners

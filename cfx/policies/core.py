@@ -46,13 +46,17 @@ class Ensemble(PolicyNetwork):
 
     def observe(self, tokens: Tensor, state: Tensor) -> Tensor:
         apart = self._apart(state)
-        return self._together(self.members.observe(tokens.repeat_interleave(self.size, 0), apart))
+        return self._together(self.members.observe(self._for_each(tokens), apart))
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         apart = self._apart(state)
-        answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
+        answers, after = self.members(self._for_each(tokens), apart)
         logits = torch.logit(answers, eps=_EDGE).view(len(state), self.size, *answers.shape[1:])
         return _median(logits).sigmoid(), self._together(after)
+
+    def _for_each(self, tokens: Tensor) -> Tensor:
+        """Returns tokens `(N, B, W, i)` for each network, `(N M, B, W, i)`; of one N no copy."""
+        return tokens.unsqueeze(1).expand(-1, self.size, -1, -1, -1).flatten(0, 1)
 
     def _apart(self, state: Tensor) -> Tensor:
         """Arranges states `(N, B, M s)` as those of each network, `(N M, B, s)`."""

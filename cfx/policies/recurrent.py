@@ -8,6 +8,7 @@ equal.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -22,6 +23,13 @@ _BYTES = 16.0
 
 _EDGE = 0.02
 """Least distance to a bound of an untrained network's answer, in unit space."""
+
+
+def _side_by_side(windows: Sequence[Tensor]) -> Tensor:
+    """Returns `(N, B, W, hidden)` of W windows; a single one, as drivers see it, is not copied."""
+    if len(windows) == 1:
+        return windows[0].unsqueeze(2)
+    return torch.stack(list(windows), dim=2)
 
 
 class RecurrentSettings(PolicySettings):
@@ -136,9 +144,10 @@ class RecurrentNetwork(PolicyNetwork):
                 recurrent = layer.recur(carried[..., : self.hidden])
                 carried = self.cell(projected[:, :, k], recurrent, carried)
                 outputs.append(carried[..., : self.hidden])
-            x = torch.stack(outputs, dim=2)
+            x = _side_by_side(outputs)
             last.append(carried)
-        return x, torch.cat(last, dim=-1)
+        after = last[0] if len(last) == 1 else torch.cat(last, dim=-1)
+        return x, after
 
     @staticmethod
     def cell(projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import torch
 from torch import Tensor
 
 from cfx.plugin import Agent, valid_range
@@ -40,10 +42,13 @@ class DriveCounts:
 
     def add(self, score: Tensor, beyond: Tensor) -> None:
         """Counts one step of D vehicles: scores `(D,)`, unusual signals `(D, 2 f)`."""
-        is_outside = score > 1.0
+        is_outside = score.numpy() > 1.0
         self.steps += len(score)
-        self.outside += int(is_outside.sum())
-        unusual = beyond[is_outside].sum(0)
+        outside = int(np.count_nonzero(is_outside))
+        if outside == 0 and self.beyond is not None:
+            return
+        self.outside += outside
+        unusual = beyond[torch.from_numpy(is_outside)].sum(0)
         self.beyond = unusual if self.beyond is None else self.beyond + unusual
 
     def add_told(self, told: Tensor, speed: Tensor, going: Tensor) -> None:
@@ -54,10 +59,11 @@ class DriveCounts:
             speed: that vehicles have, `(D,)`, m/s.
             going: which vehicles were told one step ago, bool `(D,)`.
         """
-        obliged = going & ~told.isnan()
-        changed = (speed - told).abs() > _OBEYED_MPS
-        self.told += int(obliged.sum())
-        self.changed += int((obliged & changed).sum())
+        before = told.numpy()
+        obliged = going.numpy() & ~np.isnan(before)
+        changed = np.abs(speed.numpy() - before) > _OBEYED_MPS
+        self.told += int(np.count_nonzero(obliged))
+        self.changed += int(np.count_nonzero(obliged & changed))
 
     def outside_in_words(self, policy: Agent) -> str:
         """Returns how much was driven outside what the policy has learned, in words; or ""."""

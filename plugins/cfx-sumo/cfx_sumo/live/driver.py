@@ -18,6 +18,7 @@ from itertools import compress
 from pathlib import Path
 from typing import TypedDict, Unpack, cast
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -385,12 +386,13 @@ class Driver:
         self._forget_departed(connection, now)
         self._let_go(connection, names if drive else [], names, is_new=is_new)
         rows = self._rows_for(connection, names, now)
-        times = self._vehicles.table.time[rows]
+        times = self._vehicles.table.time.numpy()[rows.numpy()]
         early = now - times < clock.period - 0.5 * clock.dt
         between: list[str] = []
-        if bool(early.any()):
+        if early.any():
             between = list(compress(names, (early & (times != now)).tolist()))
-            names, rows = list(compress(names, (~early).tolist())), rows[~early]
+            names = list(compress(names, (~early).tolist()))
+            rows = rows[torch.from_numpy(~early)]
         view = look(connection, names, self.look_ahead)
         self._view = view if drive and not between else None
         rows = rows[view.order]
@@ -428,8 +430,9 @@ class Driver:
         table, following = self._vehicles.table, rows[:count]
         going = self._histories.goes_on(rows, now, clock)
         self.counts.add_told(table.told[rows], view.seen.speed, going)
-        seen = self._remember(following, view, now, clock)
-        self._begin_free(rows[count:], view.alone, now, clock)
+        seen = self._remember(following, view, going[:count], now, clock)
+        if view.alone:
+            self._begin_free(rows[count:], view.alone, going[count:], now)
         self._take_over(connection, names, rows, seen, clock)
         first, hardest = seen.speed, torch.zeros_like(seen.speed)
         for number in range(clock.substeps):
@@ -475,7 +478,8 @@ class Driver:
             return
         count = len(view.following)
         rows = rows[:count]
-        seen = self._remember(rows, view, now, clock).rows(slice(count))
+        going = self._histories.goes_on(rows, now, clock)
+        seen = self._remember(rows, view, going, now, clock).rows(slice(count))
         table = self._vehicles.table
         for number in range(clock.substeps):
             if number > 0:
@@ -486,28 +490,37 @@ class Driver:
             seen = seen.one_step_later(speed, clock.step)
         table.expected[rows] = frame_of(seen)
 
-    def _remember(self, rows: Tensor, view: View, now: float, clock: Clock) -> Seen:
+    def _remember(
+        self, rows: Tensor, view: View, going: Tensor, now: float, clock: Clock
+    ) -> Seen:
         """Puts this instant into the histories of followers; begins those that are new.
 
         Args:
             rows: of the F followers, who stand first in the view.
             view: all D vehicles.
+            going: which of the followers were looked at one period ago, bool `(F,)`.
             now: s.
             clock: of the simulation.
 
         Returns:
             What all D vehicles do, with accelerations as over a step of the model.
         """
-        seen, new = self._histories.remember(rows, view, now, clock)
+        seen, new = self._histories.remember(rows, view, going, now, clock)
         if len(new) > 0:
             self._windows.begin(rows[new], [view.following[number] for number in new.tolist()])
         return seen
 
-    def _begin_free(self, rows: Tensor, names: list[str], now: float, clock: Clock) -> None:
-        """Begins vehicles that have no leader any more, or have just come."""
+    def _begin_free(self, rows: Tensor, names: list[str], going: Tensor, now: float) -> None:
+        """Begins vehicles that have no leader any more, or have just come.
+
+        Args:
+            rows: of the vehicles, `(D,)` int64.
+            names: their ids.
+            going: which of them were looked at one period ago, bool `(D,)`.
+            now: s.
+        """
         table = self._vehicles.table
-        stays_free = self._histories.goes_on(rows, now, clock) & table.free[rows]
-        new = (~stays_free).nonzero().flatten()
+        new = (~(going & table.free[rows])).nonzero().flatten()
         table.time[rows] = now
         if len(new) == 0:
             return
@@ -521,7 +534,7 @@ class Driver:
     ) -> None:
         """Drives from here on the vehicles that begin, with a new window and memory."""
         table = self._vehicles.table
-        for index in (~table.driven[rows]).nonzero().flatten().tolist():
+        for index in np.flatnonzero(~table.driven.numpy()[rows.numpy()]).tolist():
             name, row = names[index], int(rows[index])
             acts = connection.vehicle.getActionStepLength(name)
             if acts > clock.dt + 1e-6:
