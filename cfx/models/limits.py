@@ -6,8 +6,10 @@ Shapes: `*batch` are any leading dimensions.
 from __future__ import annotations
 
 import math
+from typing import Any, TypeVar
 
 import torch
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from torch import Tensor
 
@@ -94,7 +96,10 @@ def at_limits(limits: LimitSettings | None, speed: Tensor, dt: float) -> Tensor:
     return is_at_limit
 
 
-def at_limit(limits: LimitSettings, acceleration: Tensor) -> Tensor:
+Values = TypeVar("Values", Tensor, NDArray[Any])
+
+
+def at_limit(limits: LimitSettings, acceleration: Values) -> Values:
     """Says which accelerations `(*batch,)`, m/s2, are at a limit, bool `(*batch,)`."""
     return (acceleration >= limits.acceleration - _AT) | (
         acceleration <= -limits.emergency_deceleration + _AT

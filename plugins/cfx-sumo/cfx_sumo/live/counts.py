@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.plugin import Agent, valid_range
@@ -40,18 +41,25 @@ class DriveCounts:
     limited: int = 0
     beyond: Tensor | None = None
 
-    def add(self, score: Tensor, beyond: Tensor) -> None:
-        """Counts one step of D vehicles: scores `(D,)`, unusual signals `(D, 2 f)`."""
-        is_outside = score.numpy() > 1.0
+    def add(self, score: NDArray[np.float64], beyond: Tensor, rows: Tensor) -> None:
+        """Counts one step of D vehicles.
+
+        Args:
+            score: of each, `(D,)`.
+            beyond: unusual signals of all rows of a table, `(C, 2 f)`.
+            rows: of the vehicles, `(D,)` int64.
+        """
         self.steps += len(score)
-        outside = int(np.count_nonzero(is_outside))
-        if outside == 0 and self.beyond is not None:
+        outside = np.flatnonzero(score > 1.0)
+        if len(outside) == 0 and self.beyond is not None:
             return
-        self.outside += outside
-        unusual = beyond[torch.from_numpy(is_outside)].sum(0)
+        self.outside += len(outside)
+        unusual = beyond[rows[torch.from_numpy(outside)]].sum(0)
         self.beyond = unusual if self.beyond is None else self.beyond + unusual
 
-    def add_told(self, told: Tensor, speed: Tensor, going: Tensor) -> None:
+    def add_told(
+        self, told: NDArray[np.float64], speed: NDArray[np.float64], going: NDArray[np.bool_]
+    ) -> None:
         """Counts what became of the speeds that SUMO was told.
 
         Args:
@@ -59,9 +67,8 @@ class DriveCounts:
             speed: that vehicles have, `(D,)`, m/s.
             going: which vehicles were told one step ago, bool `(D,)`.
         """
-        before = told.numpy()
-        obliged = going.numpy() & ~np.isnan(before)
-        changed = np.abs(speed.numpy() - before) > _OBEYED_MPS
+        obliged = going & ~np.isnan(told)
+        changed = np.abs(speed - told) > _OBEYED_MPS
         self.told += int(np.count_nonzero(obliged))
         self.changed += int(np.count_nonzero(obliged & changed))
 

@@ -422,51 +422,56 @@ class Driver:
         together: Together | None,
     ) -> Iterator[None]:
         """Lets the model take its steps until the next look, and tells SUMO where they lead."""
-        names = [*view.following, *view.alone]
+        names = view.following
+        if view.alone:
+            names = [*view.following, *view.alone]
         if not names:
             self._control.bound_braking(connection, names, {})
             return
         count = len(view.following)
         table, following = self._vehicles.table, rows[:count]
+        at = rows.numpy()
         going = self._histories.goes_on(rows, now, clock)
-        self.counts.add_told(table.told[rows], view.seen.speed, going)
+        self.counts.add_told(table.told.numpy()[at], view.seen.speed.numpy(), going.numpy())
         seen = self._remember(following, view, going[:count], now, clock)
         if view.alone:
             self._begin_free(rows[count:], view.alone, going[count:], now)
         self._take_over(connection, names, rows, seen, clock)
-        first, hardest = seen.speed, torch.zeros_like(seen.speed)
+        first = speed = seen.speed.numpy()
+        hardest = np.zeros_like(first)
         for number in range(clock.substeps):
             if number > 0:
-                self._histories.append(following, seen.rows(slice(count)))
+                self._histories.append(following, seen)
             self._windows.choose(following, view.following, now + number * clock.step, clock)
-            table.steps[following] += 1
-            self.counts.add(table.score[following], table.beyond[following])
+            table.steps.numpy()[at[:count]] += 1
+            self.counts.add(table.score.numpy()[at[:count]], table.beyond, following)
+            before = seen.speed.numpy()
             speed, bound = self._model_steps.take(connection, names, rows, seen, clock.step)
             self.counts.limited += self._model_steps.count_limited(
-                seen.speed[:count], speed[:count], clock.step
+                before[:count], speed[:count], clock.step
             )
-            hardest = torch.maximum(hardest, bound)
-            leaders = None
-            if clock.substeps > 1:
-                others: dict[str, float] = {}
-                if together is not None:
-                    others = together.setdefault((clock.substeps, number), {})
-                    others.update(zip(names, speed.tolist(), strict=True))
-                    yield
-                leaders = view.leader_speeds(speed, others)
-            seen = seen.one_step_later(speed, clock.step, leaders)
+            hardest = np.maximum(hardest, bound)
+            if clock.substeps == 1:
+                break
+            after, others = torch.from_numpy(speed), dict[str, float]()
+            if together is not None:
+                others = together.setdefault((clock.substeps, number), {})
+                others.update(zip(names, speed.tolist(), strict=True))
+                yield
+            seen = seen.one_step_later(after, clock.step, view.leader_speeds(after, others))
+            table.expected[rows] = frame_of(seen)
         self.counts.free += clock.substeps * len(view.alone)
-        table.expected[rows] = frame_of(seen)
-        table.start[rows], table.ramp[rows] = first, (seen.speed - first) / clock.period
-        told = seen.speed
+        ramp = (speed - first) / clock.period
+        table.start.numpy()[at], table.ramp.numpy()[at] = first, ramp
+        told = speed
         if clock.held > 1:
-            told = first + table.ramp[rows] * clock.dt
-        table.told[rows] = told
+            told = first + ramp * clock.dt
+        table.told.numpy()[at] = told
         brakes_hard = {}
-        for index in hardest.nonzero().flatten().tolist():
+        for index in np.flatnonzero(hardest).tolist():
             brakes_hard[names[index]] = float(hardest[index])
         self._control.bound_braking(connection, names, brakes_hard)
-        set_speeds(connection, names, told.numpy())
+        set_speeds(connection, names, told)
 
     def _watch(
         self, connection: Connection, view: View, rows: Tensor, now: float, clock: Clock

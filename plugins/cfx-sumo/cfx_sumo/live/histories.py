@@ -68,15 +68,15 @@ class Histories:
             What all D vehicles do, with accelerations as over a step of the model; and which of the
             followers begin anew, `(B,)` int64: this frame stands for those before it.
         """
-        table = self._vehicles.table
-        going = going & ~table.free[rows]
+        table, at = self._vehicles.table, rows.numpy()
+        going = going & ~torch.from_numpy(table.free.numpy()[at])
         seen = view.seen
         if clock.substeps > 1 or clock.held > 1:
             seen = self._in_model_steps(rows, view, going, clock)
         self._vehicles.leaders.update(zip(view.following, view.leaders, strict=True))
         self._put(rows, seen, going.double())
-        table.time[rows] = now
-        return seen, (~going).nonzero().flatten()
+        table.time.numpy()[at] = now
+        return seen, torch.from_numpy(np.flatnonzero(~going.numpy()))
 
     def append(self, rows: Tensor, seen: Seen) -> None:
         """Puts a frame of the first F vehicles into their histories, in place of the oldest one.
@@ -130,7 +130,8 @@ class Histories:
         error[:, _LEADER_ACCELERATION] = error[:, _LEADER_SPEED] / clock.dt
         of_follower = torch.zeros(len(OBSERVED), dtype=torch.bool)
         of_follower[[_SPEED, _ACCELERATION]] = True
-        used = going[:, None] & (of_follower | leader_stays[:, None])
+        # Nothing was expected where the simulation's steps were short until now.
+        used = going[:, None] & (of_follower | leader_stays[:, None]) & ~error.isnan()
         error = torch.where(used, error, 0.0)
         steps = min(clock.substeps - 1, table.history.shape[-1])
         share = torch.arange(clock.substeps - steps, clock.substeps) / clock.substeps

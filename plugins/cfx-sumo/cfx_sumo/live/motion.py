@@ -57,7 +57,7 @@ class ModelSteps:
 
     def take(
         self, connection: Connection, names: list[str], rows: Tensor, seen: Seen, dt: float
-    ) -> tuple[Tensor, Tensor]:
+    ) -> tuple[_Floats, _Floats]:
         """Takes a step of the model.
 
         Args:
@@ -82,14 +82,13 @@ class ModelSteps:
             speed, bound = _comfortable(
                 connection, names, seen, speed, hardest.numpy(), self._bounded_by, dt
             )
-        speed = np.minimum(speed, _allowed(connection, names, seen, dt))
-        return torch.from_numpy(speed), torch.from_numpy(bound)
+        return np.minimum(speed, _allowed(connection, names, seen, dt)), bound
 
-    def count_limited(self, before: Tensor, after: Tensor, dt: float) -> int:
+    def count_limited(self, before: _Floats, after: _Floats, dt: float) -> int:
         """Returns how many vehicles are at a limit of acceleration, of speeds `(D,)` in m/s."""
         if self._limits is None:
             return 0
-        return int(at_limit(self._limits, (after - before) / dt).sum())
+        return int(np.count_nonzero(at_limit(self._limits, (after - before) / dt)))
 
     def _proposal(self, dt: float) -> RowFunction:
         """Returns the model's step of `dt` seconds as a function of vehicles' rows.

@@ -5,6 +5,7 @@ Shapes: D vehicles, n tuned parameters, L frames of a token.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -90,7 +91,7 @@ class PolicyWindows:
             now: at which the model's step begins, s.
             clock: of the simulation.
         """
-        due = self.are_due(rows, clock).nonzero().flatten()
+        due = torch.from_numpy(np.flatnonzero(self.are_due(rows, clock).numpy()))
         if len(due) == 0:
             return
         for block in due.tensor_split(-(-len(due) // _BLOCK)):
