@@ -34,8 +34,9 @@ for _ in range(300):
     sent = view_of(SubscribedReader(libsumo.vehicle, 100.0), names, 100.0)
     compiled = look(libsumo, names, 100.0)
     same = all(
-        calls[:3] == other[:3]
-        and torch.equal(calls.rows, other.rows)
+        calls.arrangement.is_still(names, other.arrangement, other.arrangement.follows)
+        and calls.arrangement[4:7] == other.arrangement[4:7]
+        and torch.equal(calls.arrangement.rows, other.arrangement.rows)
         and torch.equal(torch.stack(list(calls.seen)), torch.stack(list(other.seen)))
         for other in (sent, compiled)
     )

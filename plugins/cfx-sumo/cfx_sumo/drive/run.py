@@ -736,8 +736,8 @@ class _Run:
         again only then, or where vehicles of other vTypes have the same driver.
         """
         view = driver.looked_at()
-        if view is not None and len(view.order) == len(names):
-            looked = [*view.following, *view.alone]
+        if view is not None and len(view.names) == len(names):
+            looked = view.names
             if set(looked) == set(names):
                 return _Motions.of_view(looked, view)
         vehicle = self._sumo.vehicle

@@ -70,6 +70,9 @@ class Bridge:
         self._getters = (ctypes.c_void_p * len(addresses))(*addresses)
         self._setter = _address(libsumo, _SETTER)
         self._rows = np.empty(0, dtype=np.int64)
+        self._others = np.empty(0, dtype=np.uint8)
+        self._names: Sequence[str] = []
+        self._text = b""
         compiled.cfx_read.restype = compiled.cfx_tell.restype = ctypes.c_int64
 
     def read(self, names: Sequence[str], reach: float) -> Read | None:
@@ -85,23 +88,24 @@ class Bridge:
         rows = np.full(count, -2, dtype=np.int64)
         rows[: len(self._rows)] = self._rows[:count]
         motions = np.empty((count, 2))
-        others = ctypes.create_string_buffer(_ROOM * count + _ROOM)
+        if len(self._others) < _ROOM * (count + 1):
+            self._others = np.empty(2 * _ROOM * (count + 1), dtype=np.uint8)
         length = self._compiled.cfx_read(
             ctypes.c_void_p(self._leader),
             self._getters,
             ctypes.c_int64(count),
-            _joined(names),
+            self._joined(names),
             ctypes.c_double(reach),
-            values.ctypes.data_as(ctypes.c_void_p),
-            rows.ctypes.data_as(ctypes.c_void_p),
-            others,
-            motions.ctypes.data_as(ctypes.c_void_p),
-            ctypes.c_int64(len(others)),
+            ctypes.c_void_p(values.ctypes.data),
+            ctypes.c_void_p(rows.ctypes.data),
+            ctypes.c_void_p(self._others.ctypes.data),
+            ctypes.c_void_p(motions.ctypes.data),
+            ctypes.c_int64(len(self._others)),
         )
         if length < 0:
             return None
         self._rows = rows
-        found = others.raw[:length].decode().split("\0")[:-1]
+        found = self._others[:length].tobytes().decode().split("\0")[:-1]
         return Read(rows, found, motions[: len(found)], values)
 
     def set_speeds(self, names: Sequence[str], speeds: NDArray[np.float64]) -> int:
@@ -110,10 +114,16 @@ class Bridge:
         count: int = self._compiled.cfx_tell(
             ctypes.c_void_p(self._setter),
             ctypes.c_int64(len(names)),
-            _joined(names),
-            told.ctypes.data_as(ctypes.c_void_p),
+            self._joined(names),
+            ctypes.c_void_p(told.ctypes.data),
         )
         return count
+
+    def _joined(self, names: Sequence[str]) -> bytes:
+        """Returns names that each end with 0; mostly they are those of the last call."""
+        if names is not self._names:
+            self._names, self._text = names, "\0".join(names).encode() + b"\0"
+        return self._text
 
 
 def bridge_of(vehicle: Any) -> Bridge | None:
@@ -145,7 +155,3 @@ def _address(library: ctypes.CDLL, name: str) -> int:
     assert address is not None
     return address
 
-
-def _joined(names: Sequence[str]) -> bytes:
-    """Returns names that each end with 0."""
-    return "\0".join(names).encode() + b"\0"

@@ -58,17 +58,21 @@ class DriveCounts:
         self.beyond = unusual if self.beyond is None else self.beyond + unusual
 
     def add_told(
-        self, told: NDArray[np.float64], speed: NDArray[np.float64], going: NDArray[np.bool_]
+        self, told: NDArray[np.float64], speed: NDArray[np.float64], going: Tensor | None
     ) -> None:
         """Counts what became of the speeds that SUMO was told.
 
         Args:
             told: `(D,)`, m/s; NaN where SUMO was told none.
             speed: that vehicles have, `(D,)`, m/s.
-            going: which vehicles were told one step ago, bool `(D,)`.
+            going: which vehicles were told one step ago, bool `(D,)`; None: all.
         """
-        obliged = going & ~np.isnan(told)
         changed = np.abs(speed - told) > _OBEYED_MPS
+        if going is None:
+            self.told += len(told)
+            self.changed += int(np.count_nonzero(changed))
+            return
+        obliged = going.numpy() & ~np.isnan(told)
         self.told += int(np.count_nonzero(obliged))
         self.changed += int(np.count_nonzero(obliged & changed))
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import compress
 from pathlib import Path
 from typing import TypedDict, Unpack, cast
@@ -75,6 +76,33 @@ class DriverOptions(TypedDict, total=False):
     speed_mode: int
     seed: int | None
     average: bool
+
+
+@dataclass(frozen=True)
+class LastDrive:
+    """What the last call drove, if it drove all vehicles that it was given.
+
+    Mostly the next call is one period later and for the same vehicles, behind the same leaders.
+    Then nobody begins anew, and all were told a speed.
+
+    Attributes:
+        view: of the vehicles; None: there was no such call.
+        rows: theirs, `(D,)` int64, in the view's order.
+        time: s.
+    """
+
+    view: View | None = None
+    rows: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    time: float = math.nan
+
+    def goes_on(self, names: list[str], now: float, clock: Clock) -> bool:
+        """Says whether the same vehicles are driven one period later; a list of them is kept."""
+        is_next = abs(now - self.time - clock.period) < 0.5 * clock.dt
+        return self.view is not None and is_next and self.view.arrangement.asked is names
+
+    def is_arranged(self, view: View) -> bool:
+        """Says whether everybody is still behind the same leader."""
+        return self.view is not None and self.view.arrangement is view.arrangement
 
 
 class Driver:
@@ -178,6 +206,7 @@ class Driver:
         self._now = -math.inf
         self._clock: Clock | None = None
         self._view: View | None = None
+        self._last = LastDrive()
 
     @classmethod
     def load(
@@ -385,22 +414,33 @@ class Driver:
         self._now = now
         self._forget_departed(connection, now)
         self._let_go(connection, names if drive else [], names, is_new=is_new)
-        rows = self._rows_for(connection, names, now)
+        names, rows = self._rows_for(connection, names, now)
+        between: list[str] = []
+        if not self._last.goes_on(names, now, clock):
+            names, between, rows = self._due(names, rows, now, clock)
+        view = look(connection, names, self.look_ahead, self._last.view)
+        self._view = view if drive and not between else None
+        if not drive:
+            self._last = LastDrive()
+            self._watch(connection, view, rows[view.arrangement.order], now, clock)
+            return
+        self._hold(connection, between, now, clock)
+        yield from self._drive(connection, view, rows, now, clock, together)
+
+    def _due(
+        self, names: list[str], rows: Tensor, now: float, clock: Clock
+    ) -> tuple[list[str], list[str], Tensor]:
+        """Leaves vehicles out whose time has not come, in steps shorter than the model's.
+
+        Returns:
+            Those whose time has come, those that go on meanwhile, and the rows of the first.
+        """
         times = self._vehicles.table.time.numpy()[rows.numpy()]
         early = now - times < clock.period - 0.5 * clock.dt
-        between: list[str] = []
-        if early.any():
-            between = list(compress(names, (early & (times != now)).tolist()))
-            names = list(compress(names, (~early).tolist()))
-            rows = rows[torch.from_numpy(~early)]
-        view = look(connection, names, self.look_ahead)
-        self._view = view if drive and not between else None
-        rows = rows[view.order]
-        if drive:
-            self._hold(connection, between, now, clock)
-            yield from self._drive(connection, view, rows, now, clock, together)
-        else:
-            self._watch(connection, view, rows, now, clock)
+        if not early.any():
+            return names, [], rows
+        between = list(compress(names, (early & (times != now)).tolist()))
+        return list(compress(names, (~early).tolist())), between, rows[torch.from_numpy(~early)]
 
     def _hold(self, connection: Connection, names: list[str], now: float, clock: Clock) -> None:
         """Lets vehicles go on as they accelerate, in the steps between two of the model."""
@@ -422,21 +462,24 @@ class Driver:
         together: Together | None,
     ) -> Iterator[None]:
         """Lets the model take its steps until the next look, and tells SUMO where they lead."""
-        names = view.following
-        if view.alone:
-            names = [*view.following, *view.alone]
+        names, count = view.names, len(view.following)
         if not names:
             self._control.bound_braking(connection, names, {})
             return
-        count = len(view.following)
-        table, following = self._vehicles.table, rows[:count]
-        at = rows.numpy()
-        going = self._histories.goes_on(rows, now, clock)
-        self.counts.add_told(table.told.numpy()[at], view.seen.speed.numpy(), going.numpy())
-        seen = self._remember(following, view, going[:count], now, clock)
+        table, last = self._vehicles.table, self._last
+        unchanged = last.goes_on(view.arrangement.asked, now, clock) and last.is_arranged(view)
+        rows = last.rows if unchanged else rows[view.arrangement.order]
+        following, at = rows[:count], rows.numpy()
+        self._last = LastDrive()
+        going = None
+        if not unchanged:
+            going = self._histories.goes_on(rows, now, clock)
+        self.counts.add_told(table.told.numpy()[at], view.seen.speed.numpy(), going)
+        seen = self._remember(following, view, going, now, clock)
         if view.alone:
-            self._begin_free(rows[count:], view.alone, going[count:], now)
-        self._take_over(connection, names, rows, seen, clock)
+            self._begin_free(rows[count:], view.alone, going, now)
+        if not unchanged:
+            self._take_over(connection, names, rows, seen, clock)
         first = speed = seen.speed.numpy()
         hardest = np.zeros_like(first)
         for number in range(clock.substeps):
@@ -472,6 +515,7 @@ class Driver:
             brakes_hard[names[index]] = float(hardest[index])
         self._control.bound_braking(connection, names, brakes_hard)
         set_speeds(connection, names, told)
+        self._last = LastDrive(view, rows, now)
 
     def _watch(
         self, connection: Connection, view: View, rows: Tensor, now: float, clock: Clock
@@ -496,14 +540,15 @@ class Driver:
         table.expected[rows] = frame_of(seen)
 
     def _remember(
-        self, rows: Tensor, view: View, going: Tensor, now: float, clock: Clock
+        self, rows: Tensor, view: View, going: Tensor | None, now: float, clock: Clock
     ) -> Seen:
         """Puts this instant into the histories of followers; begins those that are new.
 
         Args:
             rows: of the F followers, who stand first in the view.
             view: all D vehicles.
-            going: which of the followers were looked at one period ago, bool `(F,)`.
+            going: which of the D vehicles were looked at one period ago, bool `(D,)`; None: all,
+                and followers were followers.
             now: s.
             clock: of the simulation.
 
@@ -515,18 +560,22 @@ class Driver:
             self._windows.begin(rows[new], [view.following[number] for number in new.tolist()])
         return seen
 
-    def _begin_free(self, rows: Tensor, names: list[str], going: Tensor, now: float) -> None:
+    def _begin_free(
+        self, rows: Tensor, names: list[str], going: Tensor | None, now: float
+    ) -> None:
         """Begins vehicles that have no leader any more, or have just come.
 
         Args:
-            rows: of the vehicles, `(D,)` int64.
+            rows: of the vehicles, `(A,)` int64.
             names: their ids.
-            going: which of them were looked at one period ago, bool `(D,)`.
+            going: as for `_remember`; these are the last of the D vehicles.
             now: s.
         """
         table = self._vehicles.table
-        new = (~(going & table.free[rows])).nonzero().flatten()
         table.time[rows] = now
+        if going is None:
+            return
+        new = (~(going[-len(rows) :] & table.free[rows])).nonzero().flatten()
         if len(new) == 0:
             return
         beginning = [names[number] for number in new.tolist()]
@@ -667,6 +716,7 @@ class Driver:
             self.forget(vehicle)
         self._swept = math.nan
         self._clock = None
+        self._last = LastDrive()
         self._roster.clear()
 
     def release(self, connection: Connection, vehicle: str) -> None:
@@ -726,8 +776,10 @@ class Driver:
             if row is not None and float(self._vehicles.table.time[row]) != now:
                 self.forget(name)
 
-    def _rows_for(self, connection: Connection, names: list[str], now: float) -> Tensor:
-        """Returns the rows of vehicles, `(D,)` int64, and drops those that have left."""
+    def _rows_for(
+        self, connection: Connection, names: list[str], now: float
+    ) -> tuple[list[str], Tensor]:
+        """Returns vehicles and their rows, `(D,)` int64, and drops those that have left."""
         if not self._vehicles.were_last(names) or len(names) != len(self._vehicles.names):
             self._forget_gone(connection, names, now)
         return self._vehicles.rows_again(names)

@@ -53,14 +53,15 @@ class Histories:
         return torch.from_numpy(np.abs(ago - clock.period) < 0.5 * clock.dt)
 
     def remember(
-        self, rows: Tensor, view: View, going: Tensor, now: float, clock: Clock
+        self, rows: Tensor, view: View, going: Tensor | None, now: float, clock: Clock
     ) -> tuple[Seen, Tensor]:
         """Puts this instant into the histories of followers.
 
         Args:
             rows: of the F followers, who stand first in the view.
             view: all D vehicles.
-            going: which of the followers were looked at one period ago, bool `(F,)`.
+            going: which of the D vehicles were looked at one period ago, bool `(D,)`; None: all,
+                and followers were followers of the same leaders.
             now: s.
             clock: of the simulation.
 
@@ -68,15 +69,20 @@ class Histories:
             What all D vehicles do, with accelerations as over a step of the model; and which of the
             followers begin anew, `(B,)` int64: this frame stands for those before it.
         """
-        table, at = self._vehicles.table, rows.numpy()
-        going = going & ~torch.from_numpy(table.free.numpy()[at])
-        seen = view.seen
+        table, at, seen = self._vehicles.table, rows.numpy(), view.seen
+        if going is None:
+            follows_on = torch.ones(len(rows), dtype=torch.bool)
+        else:
+            follows_on = going[: len(rows)] & ~torch.from_numpy(table.free.numpy()[at])
         if clock.substeps > 1 or clock.held > 1:
-            seen = self._in_model_steps(rows, view, going, clock)
-        self._vehicles.leaders.update(zip(view.following, view.leaders, strict=True))
-        self._put(rows, seen, going.double())
+            seen = self._in_model_steps(rows, view, follows_on, clock)
         table.time.numpy()[at] = now
-        return seen, torch.from_numpy(np.flatnonzero(~going.numpy()))
+        if going is None:
+            self.append(rows, seen)
+            return seen, torch.empty(0, dtype=torch.int64)
+        self._vehicles.leaders.update(zip(view.following, view.leaders, strict=True))
+        self._put(rows, seen, follows_on.double())
+        return seen, (~follows_on).nonzero().flatten()
 
     def append(self, rows: Tensor, seen: Seen) -> None:
         """Puts a frame of the first F vehicles into their histories, in place of the oldest one.

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cfx.errors import SumoError
 from cfx.plugin import FREE_ROAD_M
-from cfx_sumo.live.bridge import Read, bridge_of
+from cfx_sumo.live.bridge import bridge_of
 
 Connection = Any
 """The module `libsumo`, the module `traci`, or a connection that `traci.getConnection` gives."""
@@ -80,25 +80,99 @@ _ANOTHER, _NOBODY = -1, -2
 """Rows of a leader who is not among the vehicles that are read, and of none."""
 
 
+class Arrangement(NamedTuple):
+    """Who is ahead of whom; mostly the same as an instant ago.
+
+    Attributes:
+        asked: the D vehicles that were asked for.
+        at: places of the next vehicles ahead of them, `(D,)` int64; below 0 as in `Columns`.
+        others: the next vehicle ahead of each of which that is none of them.
+        follows: which of them have a leader, bool `(D,)`.
+        following: those, F of them.
+        leaders: their leaders.
+        alone: vehicles without a leader.
+        rows: of the leaders among the D vehicles, those that follow first, `(D,)` int64; below 0:
+            another vehicle, or none.
+        order: which of the vehicles that were asked for each is, `(D,)` int64.
+    """
+
+    asked: list[str]
+    at: NDArray[np.int64]
+    others: list[str]
+    follows: NDArray[np.bool_]
+    following: list[str]
+    leaders: list[str]
+    alone: list[str]
+    rows: Tensor
+    order: Tensor
+
+    @classmethod
+    def of(cls, names: list[str], columns: Columns, follows: NDArray[np.bool_]) -> Arrangement:
+        """Arranges vehicles, those that follow first."""
+        order = np.argsort(~follows, kind="stable")
+        count = int(np.count_nonzero(follows))
+        placed, ahead = names, columns.ahead(names)
+        if count < len(names):
+            placed = np.array(names, dtype=object)[order].tolist()
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        at = columns.at
+        among = np.where(follows & (at >= 0), place.take(at, mode="clip"), _ANOTHER)[order]
+        return cls(
+            asked=names,
+            at=at,
+            others=columns.others,
+            follows=follows,
+            following=placed[:count] if count < len(names) else names,
+            leaders=ahead[order[:count]].tolist(),
+            alone=placed[count:],
+            rows=torch.from_numpy(among),
+            order=torch.from_numpy(order),
+        )
+
+    def is_still(self, names: list[str], columns: Columns, follows: NDArray[np.bool_]) -> bool:
+        """Says whether vehicles are arranged like this."""
+        return (
+            self.asked == names
+            and np.array_equal(self.at, columns.at)
+            and np.array_equal(self.follows, follows)
+            and self.others == columns.others
+        )
+
+
 class View(NamedTuple):
     """Vehicles and who is ahead of them.
 
     Attributes:
-        following: vehicles with a leader, F of them.
-        leaders: their leaders.
-        alone: vehicles without a leader.
-        seen: what all D do, those with a leader first. The others have a leader that is as fast as
-            they are, a thousand kilometres ahead.
-        rows: of the leaders among the D vehicles, `(D,)` int64; below 0: another vehicle, or none.
-        order: which of the vehicles that were asked for each is, `(D,)` int64.
+        arrangement: who is ahead of whom; the same object as before where nothing has changed.
+        seen: what all D vehicles do, those with a leader first. The others have a leader that is as
+            fast as they are, a thousand kilometres ahead.
     """
 
-    following: list[str]
-    leaders: list[str]
-    alone: list[str]
+    arrangement: Arrangement
     seen: Seen
-    rows: Tensor
-    order: Tensor
+
+    @property
+    def following(self) -> list[str]:
+        """Vehicles with a leader, F of them."""
+        return self.arrangement.following
+
+    @property
+    def leaders(self) -> list[str]:
+        """Their leaders."""
+        return self.arrangement.leaders
+
+    @property
+    def alone(self) -> list[str]:
+        """Vehicles without a leader."""
+        return self.arrangement.alone
+
+    @property
+    def names(self) -> list[str]:
+        """All D vehicles, in the order of `seen`."""
+        if not self.alone:
+            return self.following
+        return [*self.following, *self.alone]
 
     def leader_speeds(self, speed: Tensor, others: Mapping[str, float]) -> Tensor:
         """Returns the speeds of leaders that are driven too, `(D,)`, m/s; NaN of other leaders.
@@ -107,52 +181,69 @@ class View(NamedTuple):
             speed: of the D vehicles, `(D,)`, m/s.
             others: of vehicles that other drivers drive, by their ids.
         """
-        known = torch.where(self.rows < 0, torch.nan, speed[self.rows])
+        rows = self.arrangement.rows
+        known = torch.where(rows < 0, torch.nan, speed[rows])
         if others:
-            for row in (self.rows[: len(self.leaders)] < 0).nonzero().flatten().tolist():
+            for row in (rows[: len(self.leaders)] < 0).nonzero().flatten().tolist():
                 known[row] = others.get(self.leaders[row], torch.nan)
         return known
 
 
-def look(connection: Connection, names: list[str], look_ahead: float) -> View:
+def look(
+    connection: Connection, names: list[str], look_ahead: float, before: View | None = None
+) -> View:
     """Reads vehicles and their leaders.
 
     Args:
         connection: to the simulation.
         names: the vehicles.
         look_ahead: m; a vehicle farther ahead is no leader.
+        before: what was seen an instant ago, of whatever vehicles.
 
     Raises:
         SumoError: a vehicle is not in the simulation.
     """
     vehicle = connection.vehicle
     if type(vehicle).__module__.startswith("traci"):
-        return view_of(SubscribedReader(vehicle, ("d", look_ahead)), names, look_ahead)
+        return view_of(SubscribedReader(vehicle, ("d", look_ahead)), names, look_ahead, before)
     bridge = bridge_of(vehicle)
     if bridge is not None:
         read = bridge.read(names, look_ahead)
         if read is not None:
             motions = dict(zip(read.others, read.motions.tolist(), strict=True))
-            return _view(names, _columns_of(names, read), motions.__getitem__, look_ahead)
-    return view_of(DirectReader(vehicle, look_ahead), names, look_ahead)
+            columns = Columns(read.rows, read.others, read.values.T)
+            return _view(names, columns, motions.__getitem__, look_ahead, before)
+    return view_of(DirectReader(vehicle, look_ahead), names, look_ahead, before)
 
 
 class Columns(NamedTuple):
     """What SUMO says of D vehicles.
 
     Attributes:
-        ahead: the next vehicle ahead of each, `(D,)`; "" where there is none.
-        rows: places of those among the D vehicles, `(D,)`; -1: it is another; -2: there is none.
-        values: gap to it without `minGap`, speed, acceleration, `minGap` and allowed speed,
-            `(5, D)`, SI units, as TraCI's getters answer.
+        at: places of the next vehicles ahead among the D, `(D,)`; -1: it is another; -2: there is
+            none.
+        others: those other vehicles, in order.
+        values: gap to the next vehicle ahead without `minGap`, speed, acceleration, `minGap` and
+            allowed speed, `(5, D)`, SI units, as TraCI's getters answer.
     """
 
-    ahead: NDArray[np.object_]
-    rows: NDArray[np.int64]
+    at: NDArray[np.int64]
+    others: list[str]
     values: NDArray[np.float64]
 
+    def ahead(self, names: list[str]) -> NDArray[np.object_]:
+        """Returns the next vehicle ahead of each, `(D,)`; "" where there is none."""
+        ahead = np.array([*names, "", ""], dtype=object)[self.at]
+        ahead[self.at == _ANOTHER] = self.others
+        return ahead
 
-def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahead: float) -> View:
+
+def view_of(
+    reader: DirectReader | SubscribedReader,
+    names: list[str],
+    look_ahead: float,
+    before: View | None = None,
+) -> View:
     """Reads vehicles and their leaders in one of the two ways; as `look`."""
     try:
         rows = [reader.row(name) for name in names]
@@ -160,8 +251,9 @@ def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahea
         values = np.array([(leader[1] if leader else np.inf, *row) for leader, *row in rows])
         places = {name: row for row, name in enumerate(names)} | {"": _NOBODY}
         at = np.array([places.get(name, _ANOTHER) for name in ahead], dtype=np.int64)
-        columns = Columns(np.array(ahead, dtype=object), at, values.reshape(-1, 5).T)
-        return _view(names, columns, reader.motion, look_ahead)
+        others = [name for name in ahead if name not in places]
+        columns = Columns(at, others, values.reshape(-1, 5).T)
+        return _view(names, columns, reader.motion, look_ahead, before)
     except Exception as error:
         # libsumo's and traci's are two classes of this name.
         if type(error).__name__ != "TraCIException":
@@ -172,18 +264,12 @@ def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahea
         ) from error
 
 
-def _columns_of(names: list[str], read: Read) -> Columns:
-    """Returns columns of what the bridge has read."""
-    ahead = np.array([*names, "", ""], dtype=object)[read.rows]
-    ahead[read.rows == _ANOTHER] = read.others
-    return Columns(ahead, read.rows, read.values.T)
-
-
 def _view(
     names: list[str],
     columns: Columns,
     motion: Callable[[str], Sequence[float]],
     look_ahead: float,
+    before: View | None,
 ) -> View:
     """Returns vehicles and their leaders, those with a leader first.
 
@@ -191,38 +277,28 @@ def _view(
     SUMO's own gap leaves `minGap` out. At some junctions TraCI answers a leader at -1.8e308 m,
     which is none.
     """
-    ahead, rows = columns.ahead, columns.rows
-    raw, speed, acceleration, min_gap, allowed = columns.values
+    at, (raw, speed, acceleration, min_gap, allowed) = columns.at, columns.values
     gap = raw + min_gap
-    follows = (rows != _NOBODY) & (np.abs(raw) <= FREE_ROAD_M) & (gap <= look_ahead)
-    leader_speed = np.where(follows, speed.take(rows, mode="clip"), speed)
-    leader_acceleration = np.where(follows, acceleration.take(rows, mode="clip"), 0.0)
-    for row in (follows & (rows < 0)).nonzero()[0].tolist():
-        leader_speed[row], leader_acceleration[row] = motion(ahead[row])
-    signals = [
-        speed,
-        acceleration,
-        np.where(follows, gap, FREE_ROAD_M),
-        leader_speed,
-        leader_acceleration,
-        allowed,
-        np.where(follows, min_gap, 0.0),
-    ]
-    order = np.argsort(~follows, kind="stable")
-    seen = Seen(*torch.from_numpy(np.stack(signals)[:, order]).unbind())
-    count = int(follows.sum())
-    placed = np.array(names, dtype=object)[order].tolist()
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    among = np.where(follows & (rows >= 0), place.take(rows, mode="clip"), _ANOTHER)[order]
-    return View(
-        placed[:count],
-        ahead[order[:count]].tolist(),
-        placed[count:],
-        seen,
-        torch.from_numpy(among),
-        torch.from_numpy(order),
+    follows = (at != _NOBODY) & (np.abs(raw) <= FREE_ROAD_M) & (gap <= look_ahead)
+    if before is not None and before.arrangement.is_still(names, columns, follows):
+        arrangement = before.arrangement
+    else:
+        arrangement = Arrangement.of(names, columns, follows)
+    leader_speed, leader_acceleration = np.where(
+        follows, columns.values[1:3].take(at, axis=1, mode="clip"), [speed, np.zeros_like(speed)]
     )
+    others = np.flatnonzero(at == _ANOTHER).tolist()
+    for row, name in zip(others, columns.others, strict=True):
+        if follows[row]:
+            leader_speed[row], leader_acceleration[row] = motion(name)
+    signals = np.stack(
+        [speed, acceleration, gap, leader_speed, leader_acceleration, allowed, min_gap]
+    )
+    if arrangement.alone:
+        signals[Seen._fields.index("gap"), ~follows] = FREE_ROAD_M
+        signals[Seen._fields.index("min_gap"), ~follows] = 0.0
+        signals = signals[:, arrangement.order.numpy()]
+    return View(arrangement, Seen(*torch.from_numpy(signals).unbind()))
 
 
 def _culprit(reader: DirectReader | SubscribedReader, names: list[str]) -> str:

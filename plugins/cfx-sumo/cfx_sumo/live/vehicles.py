@@ -189,12 +189,16 @@ class KnownVehicles:
         """Says whether `rows_again` was given these vehicles last, and none of them has gone."""
         return names == self._last
 
-    def rows_again(self, names: list[str]) -> Tensor:
-        """Does what `add` does; mostly for the same vehicles, where nothing is looked up."""
+    def rows_again(self, names: list[str]) -> tuple[list[str], Tensor]:
+        """Does what `add` does; mostly for the same vehicles, where nothing is looked up.
+
+        Returns:
+            The names and the rows: the same objects as last for the same vehicles.
+        """
         if names != self._last:
             self._last_rows = self.add(names)
-            self._last = list(names)
-        return self._last_rows
+            self._last = names
+        return self._last, self._last_rows
 
     def drop(self, name: str) -> None:
         """Drops a vehicle, if it is known."""
