@@ -90,6 +90,7 @@ class RowChoice:
         drivers.state[rows] = begun.state[begun.network, begun.place]
         drivers.latent[rows] = begun.latent
 
+    @torch.no_grad()
     def act(self, drivers: DriverRows, rows: Tensor, noise: Tensor | None = None) -> None:
         """Chooses the parameters of the next window of drivers, as `Agent.act` does.
 
@@ -103,7 +104,7 @@ class RowChoice:
         """
         places = self._places(drivers, rows)
         features, state = self._asked(drivers, rows, places)
-        answers, after = self._agent.core.answer(features, state)
+        answers, after = self._agent.core.act_once(features, state)
         drivers.state[rows] = after[places]
         answer = answers[places].double()
         self._agent.require_finite(answer)
@@ -120,6 +121,7 @@ class RowChoice:
         ]
         self._applier(draws=noise is not None)(len(rows), inputs, outputs)
 
+    @torch.no_grad()
     def observe(self, drivers: DriverRows, rows: Tensor) -> None:
         """Lets networks see a window of drivers without acting, as `Agent.observe` does."""
         places = self._places(drivers, rows)
