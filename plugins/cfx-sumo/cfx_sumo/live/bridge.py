@@ -30,6 +30,9 @@ _GETTERS = tuple(
 )
 _SETTER = f"_ZN7libsumo7Vehicle8setSpeedE{_TEXT}d"
 
+_SIGNALS = 7
+"""Of a vehicle that are read."""
+
 _ROOM = 256
 """Bytes for the name of a leader who is not among the vehicles that are read, on average."""
 
@@ -38,18 +41,19 @@ class Read(NamedTuple):
     """What SUMO says of D vehicles.
 
     Attributes:
-        rows: place of each vehicle's leader among them, `(D,)` int64; -1: it is another vehicle;
-            -2: there is none.
-        others: names of those other leaders, in order.
-        motions: their speeds and accelerations, `(others, 2)`, SI units.
-        values: gap to the leader without `minGap`, speed, acceleration, `minGap` and allowed
-            speed, `(D, 5)`, SI units.
+        at: place of the next vehicle ahead of each among them, `(D,)` int64; -1: it is another
+            vehicle; -2: there is none.
+        others: those other vehicles, in order.
+        follows: which of them have a leader, bool `(D,)`.
+        signals: what they and their leaders do, `(7, D)`, in the order of `Seen`.
+        unchanged: whether `at` and `follows` are those of the reading before.
     """
 
-    rows: NDArray[np.int64]
+    at: NDArray[np.int64]
     others: list[str]
-    motions: NDArray[np.float64]
-    values: NDArray[np.float64]
+    follows: NDArray[np.bool_]
+    signals: NDArray[np.float64]
+    unchanged: bool = False
 
 
 class Bridge:
@@ -69,44 +73,51 @@ class Bridge:
         addresses = [_address(libsumo, name) for name in _GETTERS]
         self._getters = (ctypes.c_void_p * len(addresses))(*addresses)
         self._setter = _address(libsumo, _SETTER)
-        self._rows = np.empty(0, dtype=np.int64)
         self._others = np.empty(0, dtype=np.uint8)
         self._names: Sequence[str] = []
         self._text = b""
         compiled.cfx_read.restype = compiled.cfx_tell.restype = ctypes.c_int64
 
-    def read(self, names: Sequence[str], reach: float) -> Read | None:
+    def read(
+        self, names: Sequence[str], reach: float, free_road: float, before: Read | None = None
+    ) -> Read | None:
         """Reads vehicles and who is ahead of them; None where SUMO does not know one of them.
 
         Args:
             names: D vehicles.
             reach: m, within which a leader counts.
+            free_road: m: the gap of vehicles without a leader.
+            before: of an instant ago, of as many vehicles; where leaders were then is looked first.
         """
         count = len(names)
-        values = np.empty((count, 5))
-        # Where leaders were at the last read: a hint, which the compiled function checks.
-        rows = np.full(count, -2, dtype=np.int64)
-        rows[: len(self._rows)] = self._rows[:count]
-        motions = np.empty((count, 2))
+        signals = np.empty((_SIGNALS, count))
+        if before is None or len(before.at) != count:
+            at, follows = np.full(count, -2, dtype=np.int64), np.zeros(count, dtype=np.bool_)
+        else:
+            at, follows = before.at.copy(), before.follows.copy()
         if len(self._others) < _ROOM * (count + 1):
             self._others = np.empty(2 * _ROOM * (count + 1), dtype=np.uint8)
+        changes = ctypes.c_int64(0)
         length = self._compiled.cfx_read(
             ctypes.c_void_p(self._leader),
             self._getters,
             ctypes.c_int64(count),
             self._joined(names),
             ctypes.c_double(reach),
-            ctypes.c_void_p(values.ctypes.data),
-            ctypes.c_void_p(rows.ctypes.data),
+            ctypes.c_double(free_road),
+            ctypes.c_void_p(signals.ctypes.data),
+            ctypes.c_void_p(at.ctypes.data),
+            ctypes.c_void_p(follows.ctypes.data),
             ctypes.c_void_p(self._others.ctypes.data),
-            ctypes.c_void_p(motions.ctypes.data),
             ctypes.c_int64(len(self._others)),
+            ctypes.byref(changes),
         )
         if length < 0:
             return None
-        self._rows = rows
-        found = self._others[:length].tobytes().decode().split("\0")[:-1]
-        return Read(rows, found, motions[: len(found)], values)
+        others = []
+        if length > 0:
+            others = self._others[:length].tobytes().decode().split("\0")[:-1]
+        return Read(at, others, follows, signals, before is not None and changes.value == 0)
 
     def set_speeds(self, names: Sequence[str], speeds: NDArray[np.float64]) -> int:
         """Tells SUMO the next speeds of vehicles, m/s; returns how many it took."""

@@ -5,7 +5,7 @@ Shapes: D vehicles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from cfx.errors import SumoError
 from cfx.plugin import FREE_ROAD_M
-from cfx_sumo.live.bridge import bridge_of
+from cfx_sumo.live.bridge import Read, bridge_of
 
 Connection = Any
 """The module `libsumo`, the module `traci`, or a connection that `traci.getConnection` gives."""
@@ -77,7 +77,7 @@ _SUBSCRIBED = (_SPEED, _ACCELERATION, _ALLOWED_SPEED, _MIN_GAP)
 """What is subscribed to, besides the leader."""
 
 _ANOTHER, _NOBODY = -1, -2
-"""Rows of a leader who is not among the vehicles that are read, and of none."""
+"""Places of a leader who is not among the vehicles that are read, and of none."""
 
 
 class Arrangement(NamedTuple):
@@ -85,10 +85,8 @@ class Arrangement(NamedTuple):
 
     Attributes:
         asked: the D vehicles that were asked for.
-        at: places of the next vehicles ahead of them, `(D,)` int64; below 0 as in `Columns`.
-        others: the next vehicle ahead of each of which that is none of them.
-        follows: which of them have a leader, bool `(D,)`.
-        following: those, F of them.
+        read: what was read of them as they were arranged so.
+        following: those with a leader, F of them.
         leaders: their leaders.
         alone: vehicles without a leader.
         rows: of the leaders among the D vehicles, those that follow first, `(D,)` int64; below 0:
@@ -97,9 +95,7 @@ class Arrangement(NamedTuple):
     """
 
     asked: list[str]
-    at: NDArray[np.int64]
-    others: list[str]
-    follows: NDArray[np.bool_]
+    read: Read
     following: list[str]
     leaders: list[str]
     alone: list[str]
@@ -107,36 +103,37 @@ class Arrangement(NamedTuple):
     order: Tensor
 
     @classmethod
-    def of(cls, names: list[str], columns: Columns, follows: NDArray[np.bool_]) -> Arrangement:
+    def of(cls, names: list[str], read: Read) -> Arrangement:
         """Arranges vehicles, those that follow first."""
-        order = np.argsort(~follows, kind="stable")
-        count = int(np.count_nonzero(follows))
-        placed, ahead = names, columns.ahead(names)
+        order = np.argsort(~read.follows, kind="stable")
+        count = int(np.count_nonzero(read.follows))
+        following, alone = names, list[str]()
         if count < len(names):
             placed = np.array(names, dtype=object)[order].tolist()
+            following, alone = placed[:count], placed[count:]
+        ahead = np.array([*names, "", ""], dtype=object)[read.at]
+        ahead[read.at == _ANOTHER] = read.others
         place = np.empty_like(order)
         place[order] = np.arange(len(order))
-        at = columns.at
-        among = np.where(follows & (at >= 0), place.take(at, mode="clip"), _ANOTHER)[order]
+        is_among = read.follows & (read.at >= 0)
+        among = np.where(is_among, place.take(read.at, mode="clip"), _ANOTHER)[order]
         return cls(
             asked=names,
-            at=at,
-            others=columns.others,
-            follows=follows,
-            following=placed[:count] if count < len(names) else names,
+            read=read,
+            following=following,
             leaders=ahead[order[:count]].tolist(),
-            alone=placed[count:],
+            alone=alone,
             rows=torch.from_numpy(among),
             order=torch.from_numpy(order),
         )
 
-    def is_still(self, names: list[str], columns: Columns, follows: NDArray[np.bool_]) -> bool:
+    def is_still(self, names: list[str], read: Read) -> bool:
         """Says whether vehicles are arranged like this."""
-        return (
-            self.asked == names
-            and np.array_equal(self.at, columns.at)
-            and np.array_equal(self.follows, follows)
-            and self.others == columns.others
+        if self.asked != names or self.read.others != read.others:
+            return False
+        return read.unchanged or (
+            np.array_equal(self.read.at, read.at)
+            and np.array_equal(self.read.follows, read.follows)
         )
 
 
@@ -208,34 +205,14 @@ def look(
         return view_of(SubscribedReader(vehicle, ("d", look_ahead)), names, look_ahead, before)
     bridge = bridge_of(vehicle)
     if bridge is not None:
-        read = bridge.read(names, look_ahead)
+        last = None if before is None else before.arrangement
+        is_same = last is not None and last.asked == names
+        read = bridge.read(
+            names, look_ahead, FREE_ROAD_M, last.read if last is not None and is_same else None
+        )
         if read is not None:
-            motions = dict(zip(read.others, read.motions.tolist(), strict=True))
-            columns = Columns(read.rows, read.others, read.values.T)
-            return _view(names, columns, motions.__getitem__, look_ahead, before)
+            return _arranged(names, read, before)
     return view_of(DirectReader(vehicle, look_ahead), names, look_ahead, before)
-
-
-class Columns(NamedTuple):
-    """What SUMO says of D vehicles.
-
-    Attributes:
-        at: places of the next vehicles ahead among the D, `(D,)`; -1: it is another; -2: there is
-            none.
-        others: those other vehicles, in order.
-        values: gap to the next vehicle ahead without `minGap`, speed, acceleration, `minGap` and
-            allowed speed, `(5, D)`, SI units, as TraCI's getters answer.
-    """
-
-    at: NDArray[np.int64]
-    others: list[str]
-    values: NDArray[np.float64]
-
-    def ahead(self, names: list[str]) -> NDArray[np.object_]:
-        """Returns the next vehicle ahead of each, `(D,)`; "" where there is none."""
-        ahead = np.array([*names, "", ""], dtype=object)[self.at]
-        ahead[self.at == _ANOTHER] = self.others
-        return ahead
 
 
 def view_of(
@@ -246,14 +223,7 @@ def view_of(
 ) -> View:
     """Reads vehicles and their leaders in one of the two ways; as `look`."""
     try:
-        rows = [reader.row(name) for name in names]
-        ahead = [leader[0] if leader else "" for leader, *_ in rows]
-        values = np.array([(leader[1] if leader else np.inf, *row) for leader, *row in rows])
-        places = {name: row for row, name in enumerate(names)} | {"": _NOBODY}
-        at = np.array([places.get(name, _ANOTHER) for name in ahead], dtype=np.int64)
-        others = [name for name in ahead if name not in places]
-        columns = Columns(at, others, values.reshape(-1, 5).T)
-        return _view(names, columns, reader.motion, look_ahead, before)
+        return _arranged(names, _read(reader, names, look_ahead), before)
     except Exception as error:
         # libsumo's and traci's are two classes of this name.
         if type(error).__name__ != "TraCIException":
@@ -264,39 +234,47 @@ def view_of(
         ) from error
 
 
-def _view(
-    names: list[str],
-    columns: Columns,
-    motion: Callable[[str], Sequence[float]],
-    look_ahead: float,
-    before: View | None,
-) -> View:
-    """Returns vehicles and their leaders, those with a leader first.
+def _read(
+    reader: DirectReader | SubscribedReader, names: list[str], look_ahead: float
+) -> Read:
+    """Reads vehicles and who is ahead of them, as `bridge.cpp` does.
 
-    `motion` answers speed and acceleration of a leader who is not among the vehicles.
     SUMO's own gap leaves `minGap` out. At some junctions TraCI answers a leader at -1.8e308 m,
     which is none.
     """
-    at, (raw, speed, acceleration, min_gap, allowed) = columns.at, columns.values
+    rows = [reader.row(name) for name in names]
+    ahead = [leader[0] if leader else "" for leader, *_ in rows]
+    values = np.array([(leader[1] if leader else np.inf, *row) for leader, *row in rows])
+    raw, speed, acceleration, min_gap, allowed = values.reshape(-1, 5).T
+    places = {name: row for row, name in enumerate(names)} | {"": _NOBODY}
+    at = np.array([places.get(name, _ANOTHER) for name in ahead], dtype=np.int64)
     gap = raw + min_gap
     follows = (at != _NOBODY) & (np.abs(raw) <= FREE_ROAD_M) & (gap <= look_ahead)
-    if before is not None and before.arrangement.is_still(names, columns, follows):
+    leader_speed = np.where(follows, speed.take(at, mode="clip"), speed)
+    leader_acceleration = np.where(follows, acceleration.take(at, mode="clip"), 0.0)
+    for row in (follows & (at == _ANOTHER)).nonzero()[0].tolist():
+        leader_speed[row], leader_acceleration[row] = reader.motion(ahead[row])
+    signals = [
+        speed,
+        acceleration,
+        np.where(follows, gap, FREE_ROAD_M),
+        leader_speed,
+        leader_acceleration,
+        allowed,
+        np.where(follows, min_gap, 0.0),
+    ]
+    others = [name for name in ahead if name not in places]
+    return Read(at, others, follows, np.stack(signals))
+
+
+def _arranged(names: list[str], read: Read, before: View | None) -> View:
+    """Returns vehicles and their leaders, those with a leader first."""
+    if before is not None and before.arrangement.is_still(names, read):
         arrangement = before.arrangement
     else:
-        arrangement = Arrangement.of(names, columns, follows)
-    leader_speed, leader_acceleration = np.where(
-        follows, columns.values[1:3].take(at, axis=1, mode="clip"), [speed, np.zeros_like(speed)]
-    )
-    others = np.flatnonzero(at == _ANOTHER).tolist()
-    for row, name in zip(others, columns.others, strict=True):
-        if follows[row]:
-            leader_speed[row], leader_acceleration[row] = motion(name)
-    signals = np.stack(
-        [speed, acceleration, gap, leader_speed, leader_acceleration, allowed, min_gap]
-    )
+        arrangement = Arrangement.of(names, read)
+    signals = read.signals
     if arrangement.alone:
-        signals[Seen._fields.index("gap"), ~follows] = FREE_ROAD_M
-        signals[Seen._fields.index("min_gap"), ~follows] = 0.0
         signals = signals[:, arrangement.order.numpy()]
     return View(arrangement, Seen(*torch.from_numpy(signals).unbind()))
 
