@@ -488,12 +488,11 @@ class Driver:
             self._windows.choose(following, view.following, now + number * clock.step, clock)
             table.steps.numpy()[at[:count]] += 1
             self.counts.add(table.score.numpy()[at[:count]], table.beyond, following)
-            before = seen.speed.numpy()
-            speed, bound = self._model_steps.take(connection, names, rows, seen, clock.step)
-            self.counts.limited += self._model_steps.count_limited(
-                before[:count], speed[:count], clock.step
-            )
-            hardest = np.maximum(hardest, bound)
+            taken = self._model_steps.take(connection, names, rows, seen, clock.step)
+            speed = taken.speed
+            self.counts.limited += int(np.count_nonzero(taken.is_limited[:count]))
+            if taken.bound is not None:
+                hardest = np.maximum(hardest, taken.bound)
             if clock.substeps == 1:
                 break
             after, others = torch.from_numpy(speed), dict[str, float]()
@@ -510,7 +509,7 @@ class Driver:
         if clock.held > 1:
             told = first + ramp * clock.dt
         table.told.numpy()[at] = told
-        brakes_hard = {}
+        brakes_hard: dict[str, float] = {}
         for index in np.flatnonzero(hardest).tolist():
             brakes_hard[names[index]] = float(hardest[index])
         self._control.bound_braking(connection, names, brakes_hard)

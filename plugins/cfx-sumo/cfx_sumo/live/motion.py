@@ -5,6 +5,8 @@ Shapes: D vehicles.
 
 from __future__ import annotations
 
+from typing import Any, NamedTuple
+
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -29,6 +31,28 @@ from cfx_sumo.live.surroundings import Connection, Seen
 from cfx_sumo.live.vehicles import KnownVehicles
 
 _Floats = NDArray[np.float64]
+
+
+_COMPUTED = ("proposed", "hardest", "speed", "is_special", "is_limited")
+"""What is computed of each vehicle: the next speed that the model and the guard propose, m/s; how
+hard it may brake, m/s2; its next speed, m/s, if nothing special bounds it; 1 where SUMO must be
+asked how hard it can brake, as it must brake hard or is faster than the limit; 1 where it is at a
+limit of acceleration."""
+
+
+class ModelStep(NamedTuple):
+    """Where a step of the model leads D vehicles.
+
+    Attributes:
+        speed: the next speeds, `(D,)`, m/s.
+        bound: how hard vehicles must be able to brake for them, `(D,)`, m/s2, 0 where comfortably
+            is enough; None: it is for all.
+        is_limited: which are at a limit of acceleration, `(D,)`; 0: not.
+    """
+
+    speed: _Floats
+    bound: _Floats | None
+    is_limited: NDArray[Any]
 
 
 class ModelSteps:
@@ -57,7 +81,7 @@ class ModelSteps:
 
     def take(
         self, connection: Connection, names: list[str], rows: Tensor, seen: Seen, dt: float
-    ) -> tuple[_Floats, _Floats]:
+    ) -> ModelStep:
         """Takes a step of the model.
 
         Args:
@@ -66,55 +90,58 @@ class ModelSteps:
             rows: theirs, `(D,)` int64.
             seen: what they do.
             dt: the step, s.
-
-        Returns:
-            The next speeds `(D,)`, m/s; and how hard vehicles must be able to brake for them, m/s2,
-            0 where comfortably is enough.
         """
         table = self._vehicles.table
-        proposed, hardest = torch.empty((2, len(rows)), dtype=torch.float64).unbind()
+        computed = torch.empty((len(_COMPUTED), len(rows)), dtype=torch.float64)
         memory = Rows(table.memory, rows)
         inputs = [*map(Rows, seen), Rows(table.parameters, rows), memory]
-        outputs = [Rows(proposed), Rows(hardest), memory]
-        self._proposal(dt)(len(rows), inputs, outputs)
-        speed, bound = proposed.numpy(), np.zeros(len(rows))
+        self._proposal(dt)(len(rows), inputs, [Rows(computed.T), memory])
+        proposed, hardest, speed, is_special, is_limited = computed.numpy()
+        if not is_special.any():
+            return ModelStep(speed, None, is_limited)
+        bound = None
         if self._bounded_by is not None:
-            speed, bound = _comfortable(
-                connection, names, seen, speed, hardest.numpy(), self._bounded_by, dt
+            proposed, bound = _comfortable(
+                connection, names, seen, proposed, hardest, self._bounded_by, dt
             )
-        return np.minimum(speed, _allowed(connection, names, seen, dt)), bound
-
-    def count_limited(self, before: _Floats, after: _Floats, dt: float) -> int:
-        """Returns how many vehicles are at a limit of acceleration, of speeds `(D,)` in m/s."""
-        if self._limits is None:
-            return 0
-        return int(np.count_nonzero(at_limit(self._limits, (after - before) / dt)))
+        speed = np.minimum(proposed, _allowed(connection, names, seen, dt))
+        if self._limits is not None:
+            is_limited = at_limit(self._limits, (speed - seen.speed.numpy()) / dt)
+        return ModelStep(speed, bound, is_limited)
 
     def _proposal(self, dt: float) -> RowFunction:
         """Returns the model's step of `dt` seconds as a function of vehicles' rows.
 
-        It takes the signals of `Seen`, parameters and the model's memory. It gives the next speeds,
-        how hard vehicles may brake now, and the memory afterwards.
+        It takes the signals of `Seen`, parameters and the model's memory. It gives `_COMPUTED` and
+        the memory afterwards.
         """
         if dt in self._proposals:
             return self._proposals[dt]
-        driven, space, bounded_by = self._driven, self._space, self._bounded_by
+        driven, space, limits = self._driven, self._space, self._limits
+        bounded_by = self._bounded_by
 
-        def propose(*values: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        def propose(*values: Tensor) -> tuple[Tensor, Tensor]:
             *signals, parameters, memory = values
             seen = Seen(*(signal[:, 0] for signal in signals))
             zero = torch.zeros_like(seen.gap)
             follower = Follower(zero, seen.speed, seen.acceleration, memory)
             leader = Leader(seen.gap, seen.leader_speed, seen.leader_acceleration, zero)
             after = advance_vehicle(driven, follower, leader, space.unpack(parameters), dt)
-            hardest = zero
+            speed, hardest, is_special = after.speed, zero, seen.speed > seen.allowed
             if bounded_by is not None:
                 hardest = hardest_braking(seen, bounded_by)
-            return after.speed[:, None], hardest[:, None], after.memory
+                is_special = is_special | (hardest > bounded_by.comfortable_deceleration)
+                speed = torch.maximum(speed, (seen.speed - hardest * dt).clamp(min=0.0))
+            speed = torch.minimum(speed, seen.allowed)
+            is_limited = torch.zeros_like(is_special)
+            if limits is not None:
+                is_limited = at_limit(limits, (speed - seen.speed) / dt)
+            flags = is_special.to(zero.dtype), is_limited.to(zero.dtype)
+            return torch.stack([after.speed, hardest, speed, *flags], -1), after.memory
 
         key = step_key(driven)
         if key is not None:
-            bounds = None if bounded_by is None else bounded_by.model_dump()
+            bounds = [None if bound is None else bound.model_dump() for bound in (limits, bounded_by)]
             key = [key, [repr(parameter) for parameter in space], bounds, dt, folder_hash(__file__)]
         widths = [1] * len(Seen._fields) + [len(space), driven.memory_size]
         self._proposals[dt] = row_function(propose, widths, key)
