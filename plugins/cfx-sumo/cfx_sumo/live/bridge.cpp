@@ -14,6 +14,7 @@
 
 using Getter = double (*)(const std::string&);
 using Leader = std::pair<std::string, double> (*)(const std::string&, double);
+using Word = std::string (*)(const std::string&);
 using Setter = void (*)(const std::string&, double);
 
 // Signals of a vehicle, in the order of `Seen` in surroundings.py.
@@ -93,6 +94,28 @@ extern "C" int64_t cfx_read(Leader leader_of, const Getter* getters, int64_t cou
         signal(LEADER_ACCELERATION)[i] = signal(ACCELERATION)[rows[i]];
     }
     return end - others;
+}
+
+// Reads one word of each vehicle, such as its lane; words end with 0. Returns their length; -1 and -2
+// as above.
+extern "C" int64_t cfx_words(Word word_of, int64_t count, const char* names, char* words,
+                             int64_t room) {
+    char* end = words;
+    std::string name;
+    try {
+        for (int64_t i = 0; i < count; ++i) {
+            name = names;
+            names += name.size() + 1;
+            const std::string word = word_of(name);
+            const int64_t size = static_cast<int64_t>(word.size()) + 1;
+            if (end + size > words + room) return -2;
+            std::memcpy(end, word.c_str(), size);
+            end += size;
+        }
+    } catch (...) {
+        return -1;
+    }
+    return end - words;
 }
 
 // Tells SUMO the next speeds of vehicles. Returns how many it took.

@@ -28,13 +28,14 @@ _GETTERS = tuple(
     f"_ZN7libsumo7Vehicle{len(name)}{name}E{_TEXT}"
     for name in ("getSpeed", "getAcceleration", "getMinGap", "getAllowedSpeed")
 )
+_LANE = f"_ZN7libsumo7Vehicle9getLaneIDE{_TEXT}"
 _SETTER = f"_ZN7libsumo7Vehicle8setSpeedE{_TEXT}d"
 
 _SIGNALS = 7
 """Of a vehicle that are read."""
 
 _ROOM = 256
-"""Bytes for the name of a leader who is not among the vehicles that are read, on average."""
+"""Bytes for a word of a vehicle, such as its lane, on average."""
 
 
 class Read(NamedTuple):
@@ -72,11 +73,13 @@ class Bridge:
         self._leader = _address(libsumo, _LEADER)
         addresses = [_address(libsumo, name) for name in _GETTERS]
         self._getters = (ctypes.c_void_p * len(addresses))(*addresses)
+        self._lane = _address(libsumo, _LANE)
         self._setter = _address(libsumo, _SETTER)
-        self._others = np.empty(0, dtype=np.uint8)
+        self._text_room = np.empty(0, dtype=np.uint8)
         self._names: Sequence[str] = []
         self._text = b""
-        compiled.cfx_read.restype = compiled.cfx_tell.restype = ctypes.c_int64
+        for function in (compiled.cfx_read, compiled.cfx_words, compiled.cfx_tell):
+            function.restype = ctypes.c_int64
 
     def read(
         self, names: Sequence[str], reach: float, free_road: float, before: Read | None = None
@@ -95,8 +98,7 @@ class Bridge:
             at, follows = np.full(count, -2, dtype=np.int64), np.zeros(count, dtype=np.bool_)
         else:
             at, follows = before.at.copy(), before.follows.copy()
-        if len(self._others) < _ROOM * (count + 1):
-            self._others = np.empty(2 * _ROOM * (count + 1), dtype=np.uint8)
+        text = self._room_for(count)
         changes = ctypes.c_int64(0)
         length = self._compiled.cfx_read(
             ctypes.c_void_p(self._leader),
@@ -108,16 +110,26 @@ class Bridge:
             ctypes.c_void_p(signals.ctypes.data),
             ctypes.c_void_p(at.ctypes.data),
             ctypes.c_void_p(follows.ctypes.data),
-            ctypes.c_void_p(self._others.ctypes.data),
-            ctypes.c_int64(len(self._others)),
+            ctypes.c_void_p(text.ctypes.data),
+            ctypes.c_int64(len(text)),
             ctypes.byref(changes),
         )
         if length < 0:
             return None
-        others = []
-        if length > 0:
-            others = self._others[:length].tobytes().decode().split("\0")[:-1]
+        others = _words(text[:length])
         return Read(at, others, follows, signals, before is not None and changes.value == 0)
+
+    def lanes(self, names: Sequence[str]) -> list[str] | None:
+        """Returns the lane of each vehicle; None where SUMO does not know one of them."""
+        text = self._room_for(len(names))
+        length = self._compiled.cfx_words(
+            ctypes.c_void_p(self._lane),
+            ctypes.c_int64(len(names)),
+            self._joined(names),
+            ctypes.c_void_p(text.ctypes.data),
+            ctypes.c_int64(len(text)),
+        )
+        return None if length < 0 else _words(text[:length])
 
     def set_speeds(self, names: Sequence[str], speeds: NDArray[np.float64]) -> int:
         """Tells SUMO the next speeds of vehicles, m/s; returns how many it took."""
@@ -129,6 +141,12 @@ class Bridge:
             ctypes.c_void_p(told.ctypes.data),
         )
         return count
+
+    def _room_for(self, count: int) -> NDArray[np.uint8]:
+        """Returns room for a word of each of so many vehicles, which is used again."""
+        if len(self._text_room) < _ROOM * (count + 1):
+            self._text_room = np.empty(2 * _ROOM * (count + 1), dtype=np.uint8)
+        return self._text_room
 
     def _joined(self, names: Sequence[str]) -> bytes:
         """Returns names that each end with 0; mostly they are those of the last call."""
@@ -166,3 +184,9 @@ def _address(library: ctypes.CDLL, name: str) -> int:
     assert address is not None
     return address
 
+
+def _words(text: NDArray[np.uint8]) -> list[str]:
+    """Returns the words of a text, each of which ends with 0."""
+    if len(text) == 0:
+        return []
+    return text.tobytes().decode().split("\0")[:-1]

@@ -5,7 +5,7 @@ Shapes: D vehicles.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -213,6 +213,16 @@ def look(
         if read is not None:
             return _arranged(names, read, before)
     return view_of(DirectReader(vehicle, look_ahead), names, look_ahead, before)
+
+
+def lanes_of(connection: Connection, names: Sequence[str]) -> list[str]:
+    """Returns the lane of each vehicle, by SUMO's ids."""
+    bridge = bridge_of(connection.vehicle)
+    if bridge is not None:
+        lanes = bridge.lanes(names)
+        if lanes is not None:
+            return lanes
+    return [connection.vehicle.getLaneID(name) for name in names]
 
 
 def view_of(
