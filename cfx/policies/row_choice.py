@@ -224,10 +224,9 @@ def _code_of(agent: Agent, *components: type) -> list[object] | None:
 
 def _facts_of(agent: Agent) -> dict[str, Tensor]:
     """Returns what each network has beside its weights, by name, `(N, width)`."""
-    facts = {}
+    facts: dict[str, Tensor] = {}
     if agent.valid_range is not None:
-        for name, values in agent.valid_range._asdict().items():
-            facts[name] = values
+        facts |= agent.valid_range._asdict()
     for name in ("pooled", "dispersion"):
         values = getattr(agent, name)
         if values is not None:

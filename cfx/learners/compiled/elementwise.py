@@ -20,9 +20,9 @@ from torch import Tensor
 
 from cfx.core.component import content_key, folder_hash
 from cfx.learners.compiled.adjoint import adjoint
-from cfx.simulation.kernel.recording import Program, record_function
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import Unsupported
+from cfx.simulation.kernel.recording import Program, record_function
 from cfx.simulation.kernel.source import head
 
 _BLOCK = 64

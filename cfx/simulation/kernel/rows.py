@@ -30,9 +30,9 @@ log = logging.getLogger(__name__)
 _BLOCK = 64
 """Rows that are loaded, computed and stored together."""
 
-_COLUMN = """\
-// A table (C, width): where it lies, and its strides. Row j of a call is row rows[j] of the table, or
-// row j where there are none.
+_TABLES = """\
+// A table (C, width): where it lies, and its strides. Row j of a call is row rows[j] of the table,
+// or row j where there are none.
 struct Table { real* data; long row; long column; const long* rows; };
 #define CALLED static __attribute__((noinline)) void
 CALLED load(real* to, const Table& table, long n, long first, long count) {
@@ -200,5 +200,5 @@ def _source(program: Program) -> str:
         "    const long count = std::min(BLOCK, rows - first);",
     ]
     loop = ["    #pragma GCC ivdep", "    for (long j = 0; j < BLOCK; ++j) {", *body, "    }"]
-    text = [head(torch.float64, _BLOCK), _COLUMN, *begin, *loaded, *loop, *stored, "  }", "}"]
+    text = [head(torch.float64, _BLOCK), _TABLES, *begin, *loaded, *loop, *stored, "  }", "}"]
     return "\n".join(text) + "\n"

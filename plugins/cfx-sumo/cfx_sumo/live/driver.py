@@ -21,6 +21,7 @@ from typing import TypedDict, Unpack, cast
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.errors import DataError, SumoError
@@ -48,6 +49,9 @@ from cfx_sumo.live.windows import PolicyWindows
 
 _BOUNDS_BRAKING = 4
 """Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""
+
+_Floats = NDArray[np.float64]
+_Places = NDArray[np.int64]
 
 Together = dict[tuple[int, int], dict[str, float]]
 """Speeds of vehicles, m/s, that drivers of one simulation expect within a step of it: by how many
@@ -466,20 +470,11 @@ class Driver:
         if not names:
             self._control.bound_braking(connection, names, {})
             return
-        table, last = self._vehicles.table, self._last
-        unchanged = last.goes_on(view.arrangement.asked, now, clock) and last.is_arranged(view)
-        rows = last.rows if unchanged else rows[view.arrangement.order]
+        table, (rows, seen) = (
+            self._vehicles.table,
+            self._take_up(connection, view, rows, now, clock),
+        )
         following, at = rows[:count], rows.numpy()
-        self._last = LastDrive()
-        going = None
-        if not unchanged:
-            going = self._histories.goes_on(rows, now, clock)
-        self.counts.add_told(table.told.numpy()[at], view.seen.speed.numpy(), going)
-        seen = self._remember(following, view, going, now, clock)
-        if view.alone:
-            self._begin_free(rows[count:], view.alone, going, now)
-        if not unchanged:
-            self._take_over(connection, names, rows, seen, clock)
         first = speed = seen.speed.numpy()
         hardest = np.zeros_like(first)
         for number in range(clock.substeps):
@@ -501,9 +496,58 @@ class Driver:
                 others.update(zip(names, speed.tolist(), strict=True))
                 yield
             seen = seen.one_step_later(after, clock.step, view.leader_speeds(after, others))
+        if clock.substeps > 1:
             table.expected[rows] = frame_of(seen)
         self.counts.free += clock.substeps * len(view.alone)
-        ramp = (speed - first) / clock.period
+        self._tell(connection, names, at, first, speed, hardest, clock)
+        self._last = LastDrive(view, rows, now)
+
+    def _take_up(
+        self, connection: Connection, view: View, rows: Tensor, now: float, clock: Clock
+    ) -> tuple[Tensor, Seen]:
+        """Puts what was seen into the vehicles' rows, and begins those that are new.
+
+        Returns:
+            The rows in the view's order, `(D,)` int64, and what all vehicles do.
+        """
+        table, last, count = self._vehicles.table, self._last, len(view.following)
+        unchanged = last.goes_on(view.arrangement.asked, now, clock) and last.is_arranged(view)
+        rows = last.rows if unchanged else rows[view.arrangement.order]
+        # Until all is done nothing is known of this call: it may end in an error.
+        self._last = LastDrive()
+        going = None
+        if not unchanged:
+            going = self._histories.goes_on(rows, now, clock)
+        self.counts.add_told(table.told.numpy()[rows.numpy()], view.seen.speed.numpy(), going)
+        seen = self._remember(rows[:count], view, going, now, clock)
+        if view.alone:
+            self._begin_free(rows[count:], view.alone, going, now)
+        if not unchanged:
+            self._take_over(connection, view.names, rows, seen, clock)
+        return rows, seen
+
+    def _tell(
+        self,
+        connection: Connection,
+        names: list[str],
+        at: _Places,
+        first: _Floats,
+        speed: _Floats,
+        hardest: _Floats,
+        clock: Clock,
+    ) -> None:
+        """Tells SUMO the next speeds of vehicles, and how hard they must be able to brake.
+
+        Args:
+            connection: to the simulation.
+            names: the D vehicles.
+            at: their rows, `(D,)`.
+            first: their speeds now, `(D,)`, m/s.
+            speed: those at the next look, `(D,)`, m/s.
+            hardest: how hard they must be able to brake, `(D,)`, m/s2; 0: comfortably is enough.
+            clock: of the simulation.
+        """
+        table, ramp = self._vehicles.table, (speed - first) / clock.period
         table.start.numpy()[at], table.ramp.numpy()[at] = first, ramp
         told = speed
         if clock.held > 1:
@@ -514,7 +558,6 @@ class Driver:
             brakes_hard[names[index]] = float(hardest[index])
         self._control.bound_braking(connection, names, brakes_hard)
         set_speeds(connection, names, told)
-        self._last = LastDrive(view, rows, now)
 
     def _watch(
         self, connection: Connection, view: View, rows: Tensor, now: float, clock: Clock
@@ -559,9 +602,7 @@ class Driver:
             self._windows.begin(rows[new], [view.following[number] for number in new.tolist()])
         return seen
 
-    def _begin_free(
-        self, rows: Tensor, names: list[str], going: Tensor | None, now: float
-    ) -> None:
+    def _begin_free(self, rows: Tensor, names: list[str], going: Tensor | None, now: float) -> None:
         """Begins vehicles that have no leader any more, or have just come.
 
         Args:

@@ -109,10 +109,8 @@ class Histories:
         """Returns the gap of a vehicle at its last frame, m."""
         return float(self._vehicles.table.history[row, _GAP, -1])
 
-    def _in_model_steps(
-        self, rows: Tensor, view: View, going: Tensor, clock: Clock
-    ) -> Seen:
-        """Returns what all D vehicles do, with accelerations of the F followers over a model's step.
+    def _in_model_steps(self, rows: Tensor, view: View, going: Tensor, clock: Clock) -> Seen:
+        """Returns what all D vehicles do, F of them with accelerations over a step of the model.
 
         SUMO's are over its own step. In a long one the frames of the model's steps were expected;
         what happened instead is spread over them evenly. A leader that is new was not expected.

@@ -141,7 +141,9 @@ class ModelSteps:
 
         key = step_key(driven)
         if key is not None:
-            bounds = [None if bound is None else bound.model_dump() for bound in (limits, bounded_by)]
+            bounds = [
+                None if bound is None else bound.model_dump() for bound in (limits, bounded_by)
+            ]
             key = [key, [repr(parameter) for parameter in space], bounds, dt, folder_hash(__file__)]
         widths = [1] * len(Seen._fields) + [len(space), driven.memory_size]
         self._proposals[dt] = row_function(propose, widths, key)

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.errors import SumoError
@@ -244,9 +243,7 @@ def view_of(
         ) from error
 
 
-def _read(
-    reader: DirectReader | SubscribedReader, names: list[str], look_ahead: float
-) -> Read:
+def _read(reader: DirectReader | SubscribedReader, names: list[str], look_ahead: float) -> Read:
     """Reads vehicles and who is ahead of them, as `bridge.cpp` does.
 
     SUMO's own gap leaves `minGap` out. At some junctions TraCI answers a leader at -1.8e308 m,

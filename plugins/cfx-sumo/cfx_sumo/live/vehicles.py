@@ -1,7 +1,8 @@
 """What a live driver knows of vehicles: one table of tensors, and whose row is which.
 
 Shapes: C vehicles, L frames of a token, n tuned parameters, m width of the model's memory, s width
-of the networks' state, c features of conditioning, k driver features, q numbers that a stochastic head keeps.
+of the networks' state, c features of conditioning, k driver features, q numbers that a stochastic
+head keeps.
 """
 
 from __future__ import annotations
