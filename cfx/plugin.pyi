@@ -78,7 +78,8 @@ from .models.base import (
 )
 from .models.limits import (
     LimitSettings as LimitSettings,
-    at_limit as at_limit,
+    at_limits as at_limits,
+    is_at_limit as is_at_limit,
     limited_speed as limited_speed,
 )
 from .models.vtype import InSumo as InSumo, VType as VType, sumo_speed as sumo_speed

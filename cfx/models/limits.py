@@ -15,6 +15,9 @@ from torch import Tensor
 
 from cfx.core.component import Settings
 
+Values = TypeVar("Values", Tensor, NDArray[Any])
+"""A tensor or an array."""
+
 _AT = 1e-6
 """m/s2: an acceleration this close to a limit counts as being at it."""
 
@@ -89,17 +92,14 @@ def at_limits(limits: LimitSettings | None, speed: Tensor, dt: float) -> Tensor:
     Returns:
         `(*batch, K + 1)` bool, for the acceleration on the way to each frame; frame 0 has none.
     """
-    is_at_limit = torch.zeros_like(speed, dtype=torch.bool)
+    frames = torch.zeros_like(speed, dtype=torch.bool)
     if limits is None:
-        return is_at_limit
-    is_at_limit[..., 1:] = at_limit(limits, speed.diff(dim=-1) / dt)
-    return is_at_limit
+        return frames
+    frames[..., 1:] = is_at_limit(limits, speed.diff(dim=-1) / dt)
+    return frames
 
 
-Values = TypeVar("Values", Tensor, NDArray[Any])
-
-
-def at_limit(limits: LimitSettings, acceleration: Values) -> Values:
+def is_at_limit(limits: LimitSettings, acceleration: Values) -> Values:
     """Says which accelerations `(*batch,)`, m/s2, are at a limit, bool `(*batch,)`."""
     return (acceleration >= limits.acceleration - _AT) | (
         acceleration <= -limits.emergency_deceleration + _AT

@@ -119,8 +119,9 @@ class Driver:
     Life cycle of a vehicle: it is driven from the first `step` that names it. Behind a leader the
     policy sees the last L frames of that vehicle and of its leader, the first frame standing for
     those before, and chooses parameters every `windows.stride` steps *of that vehicle*. Vehicles
-    whose window begins are one batch. That is the closed loop in which cfx evaluates a policy, to
-    the last bits. A vehicle that was not stepped one time step ago, or had no leader, begins anew.
+    whose window begins are one batch. That is the closed loop in which cfx evaluates a policy; what
+    is compiled rounds exponentials and powers otherwise in their last bits. A vehicle that was not
+    stepped one time step ago, or had no leader, begins anew.
 
     Without a leader within `look_ahead` the policy's own model drives with the parameters to which
     the policy fades outside what it has learned, to the lane's limit: a car-following policy has

@@ -21,8 +21,8 @@ from cfx.plugin import (
     RowFunction,
     Rows,
     advance_vehicle,
-    at_limit,
     folder_hash,
+    is_at_limit,
     row_function,
     step_key,
 )
@@ -106,7 +106,7 @@ class ModelSteps:
             )
         speed = np.minimum(proposed, _allowed(connection, names, seen, dt))
         if self._limits is not None:
-            is_limited = at_limit(self._limits, (speed - seen.speed.numpy()) / dt)
+            is_limited = is_at_limit(self._limits, (speed - seen.speed.numpy()) / dt)
         return ModelStep(speed, bound, is_limited)
 
     def _proposal(self, dt: float) -> RowFunction:
@@ -135,7 +135,7 @@ class ModelSteps:
             speed = torch.minimum(speed, seen.allowed)
             is_limited = torch.zeros_like(is_special)
             if limits is not None:
-                is_limited = at_limit(limits, (speed - seen.speed) / dt)
+                is_limited = is_at_limit(limits, (speed - seen.speed) / dt)
             flags = is_special.to(zero.dtype), is_limited.to(zero.dtype)
             return torch.stack([after.speed, hardest, speed, *flags], -1), after.memory
 
