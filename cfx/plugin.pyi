@@ -79,6 +79,7 @@ from .models.base import (
 from .models.limits import (
     LimitSettings as LimitSettings,
     at_limits as at_limits,
+    is_at_limit as is_at_limit,
     limited_speed as limited_speed,
 )
 from .models.vtype import InSumo as InSumo, VType as VType, sumo_speed as sumo_speed
@@ -90,6 +91,12 @@ from .simulation.base import (
     Stepper as Stepper,
 )
 from .simulation.kernel.compiler import build_library as build_library
+from .simulation.kernel.rows import (
+    RowFunction as RowFunction,
+    Rows as Rows,
+    row_function as row_function,
+)
+from .simulation.kernel.run import step_key as step_key
 from .simulation.rollout import MemoryStepper as MemoryStepper
 from .simulation.rollout import simulate_follower as simulate_follower
 from .simulation.settings import WindowSettings as WindowSettings
@@ -157,6 +164,7 @@ from .policies.known_drivers import (
     base_of as base_of,
     driver_features_of as driver_features_of,
 )
+from .policies.row_choice import DriverRows as DriverRows, RowChoice as RowChoice
 from .policies.ready import READY_FOLDER as READY_FOLDER, traffic_table as traffic_table
 
 # Learners

@@ -6,12 +6,17 @@ Shapes: `*batch` are any leading dimensions.
 from __future__ import annotations
 
 import math
+from typing import Any, TypeVar
 
 import torch
+from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from torch import Tensor
 
 from cfx.core.component import Settings
+
+Values = TypeVar("Values", Tensor, NDArray[Any])
+"""A tensor or an array."""
 
 _AT = 1e-6
 """m/s2: an acceleration this close to a limit counts as being at it."""
@@ -90,11 +95,15 @@ def at_limits(limits: LimitSettings | None, speed: Tensor, dt: float) -> Tensor:
         `(*batch, K + 1)` bool. Frame k is judged by the acceleration from frame k - 1 to k; frame 0
         is False.
     """
-    is_at_limit = torch.zeros_like(speed, dtype=torch.bool)
+    frames = torch.zeros_like(speed, dtype=torch.bool)
     if limits is None:
-        return is_at_limit
-    acceleration = speed.diff(dim=-1) / dt
-    is_at_limit[..., 1:] = (acceleration >= limits.acceleration - _AT) | (
+        return frames
+    frames[..., 1:] = is_at_limit(limits, speed.diff(dim=-1) / dt)
+    return frames
+
+
+def is_at_limit(limits: LimitSettings, acceleration: Values) -> Values:
+    """Says which accelerations `(*batch,)`, m/s2, are at a limit, bool `(*batch,)`."""
+    return (acceleration >= limits.acceleration - _AT) | (
         acceleration <= -limits.emergency_deceleration + _AT
     )
-    return is_at_limit

@@ -220,15 +220,23 @@ class Agent:
             PluginError: the networks answer numbers that are not finite.
         """
         answer, after = self._answer(history, state)
+        self.require_finite(answer)
+        if generator is not None and self.core.head.is_stochastic:
+            shape = (len(answer), self.core.head.noise_width)
+            noise = torch.randn(shape, generator=generator, dtype=torch.float64)
+        return self.apply(answer, history, after, noise)
+
+    def require_finite(self, answer: Tensor) -> None:
+        """Checks answers of the networks.
+
+        Raises:
+            PluginError: they are not finite.
+        """
         if not bool(answer.isfinite().all()):
             raise PluginError(
                 f"{registry.origin(self.core.policy)}: its networks answer numbers that are not"
                 " finite; train with a smaller learner.learning_rate, or repair that policy"
             )
-        if generator is not None and self.core.head.is_stochastic:
-            shape = (len(answer), self.core.head.noise_width)
-            noise = torch.randn(shape, generator=generator, dtype=torch.float64)
-        return self._apply(answer, history, after, noise)
 
     def choose(
         self, history: History, state: AgentState, noise: Tensor | None = None
@@ -245,7 +253,7 @@ class Agent:
             As `act`. Answers of the networks that are not finite make parameters that are not.
         """
         answer, after = self._answer(history, state)
-        return self._apply(answer, history, after, noise)
+        return self.apply(answer, history, after, noise)
 
     def free_road_parameters(self, network: Tensor, base: Tensor | None) -> Tensor:
         """Returns the parameters of D drivers whom nobody is ahead of, `(D, n)`, SI units.
@@ -330,14 +338,21 @@ class Agent:
         answer = answers[state.network, state.place].to(history["follower_speed"].dtype)
         return answer, state._replace(state=after)
 
-    def _apply(
+    def apply(
         self, answer: Tensor, history: History, state: AgentState, noise: Tensor | None
     ) -> tuple[Tensor, AgentState]:
-        """Turns the networks' answers into parameters `(D, n)`, SI units; returns the state too."""
+        """Turns the networks' answers into parameters `(D, n)`, SI units; returns the state too.
+
+        Args:
+            answer: of the networks, `(D, n)`.
+            history: as for `act`.
+            state: where the drivers stand; of the networks' own state nothing is read.
+            noise: as for `choose`.
+        """
         if self.valid_range is not None:
             situation = situation_of(history)
-            score = self.valid_range.score(situation, state.network)
-            beyond = self.valid_range.beyond(situation, state.network)
+            learned = ValidRange(*(self._of(values, state.network) for values in self.valid_range))
+            score, beyond = learned.score(situation), learned.beyond(situation)
             state = state._replace(score=score, beyond=beyond)
         unit = self._faded(answer.double(), state).to(answer.dtype)
         chosen = self.core.head.measured(self.space.from_unit(unit), history, self.dt)
@@ -345,7 +360,7 @@ class Agent:
             return chosen, state
         noise = noise.to(chosen)
         if self.dispersion is not None:
-            noise = noise * self.dispersion[state.network, None].to(noise)
+            noise = noise * self._of(self.dispersion, state.network)[:, None].to(noise)
         window_s = self.windows.stride * self.dt
         drawn, latent = self.core.head.sampled(chosen, noise, state.latent.to(chosen), window_s)
         return drawn, state._replace(latent=latent.to(state.latent))
@@ -357,10 +372,16 @@ class Agent:
         if fallback is None:
             if self.pooled is None:
                 return unit
-            pooled = self.pooled[state.network].double()
+            pooled = self._of(self.pooled, state.network).double()
             fallback = self.space.to_unit(self.core.head.completed(pooled))
         weight = weight_of_answer(state.score)[:, None]
         return torch.where(weight < 1.0, blended(fallback, unit, weight), unit)
+
+    def _of(self, values: Tensor, network: Tensor) -> Tensor:
+        """Returns what each driver's network has of values `(N, *batch)`, `(D, *batch)`."""
+        if len(self.names) == 1:
+            return values.expand(network.shape[0], *values.shape[1:])
+        return values[network]
 
     def _unit_base(self, network: Tensor, context: DriverContext) -> Tensor | None:
         """Returns the drivers' base in unit space, `(D, n)`, in double precision."""

@@ -62,6 +62,21 @@ class PolicyNetwork(nn.Module, ABC):
             window. Reading W windows at once or one by one gives the same.
         """
 
+    def act_once(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """Chooses the parameters of one window, to the bits those of `forward`.
+
+        It is for drivers who act now, of whom no gradient is asked: a network may compute in place.
+
+        Args:
+            tokens: `(N, B, f)`, normalised.
+            state: `(N, B, s)`.
+
+        Returns:
+            Parameters in unit space `(N, B, n)`, and the state afterwards.
+        """
+        answers, after = self(tokens[:, :, None], state)
+        return answers[:, :, 0], after
+
 
 _NAMED_INPUTS = named(INPUT_SETS, partial(registry.names, "input"), "input")
 _NAMED_FEATURES = named(DRIVER_FEATURE_SETS, DRIVER_FEATURES.keys, "driver feature")

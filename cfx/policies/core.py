@@ -46,13 +46,22 @@ class Ensemble(PolicyNetwork):
 
     def observe(self, tokens: Tensor, state: Tensor) -> Tensor:
         apart = self._apart(state)
-        return self._together(self.members.observe(tokens.repeat_interleave(self.size, 0), apart))
+        return self._together(self.members.observe(self._for_each(tokens), apart))
 
     def forward(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         apart = self._apart(state)
-        answers, after = self.members(tokens.repeat_interleave(self.size, 0), apart)
+        answers, after = self.members(self._for_each(tokens), apart)
         logits = torch.logit(answers, eps=_EDGE).view(len(state), self.size, *answers.shape[1:])
         return _median(logits).sigmoid(), self._together(after)
+
+    def act_once(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        answers, after = self.members.act_once(self._for_each(tokens), self._apart(state))
+        logits = torch.logit(answers, eps=_EDGE).view(len(state), self.size, *answers.shape[1:])
+        return _median(logits).sigmoid_(), self._together(after)
+
+    def _for_each(self, tokens: Tensor) -> Tensor:
+        """Returns tokens `(N, *batch)` for each network, `(N M, *batch)`; of one N no copy."""
+        return tokens.unsqueeze(1).expand(-1, self.size, *tokens.shape[1:]).flatten(0, 1)
 
     def _apart(self, state: Tensor) -> Tensor:
         """Arranges states `(N, B, M s)` as those of each network, `(N M, B, s)`."""
@@ -156,6 +165,11 @@ class AgentCore:
         """
         answer, after = self.network(self.scaler(features[:, :, None]), state)
         return answer[:, :, 0], after
+
+    def act_once(self, features: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """As `answer`, to the bits, for drivers who act now, of whom no gradient is asked."""
+        scaled = (features - self.scaler.mean[:, None]).div_(self.scaler.scale[:, None])
+        return self.network.act_once(scaled, state)
 
     def observe(self, features: Tensor, state: Tensor, present: Tensor) -> Tensor:
         """Lets the networks see one window without acting.

@@ -29,6 +29,13 @@ class GruNetwork(RecurrentNetwork):
         new = torch.tanh(projected[..., two:] + reset * recurrent[..., two:])
         return torch.lerp(new, carried, update)
 
+    @classmethod
+    def cell_in_place(cls, projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:
+        two = 2 * (projected.shape[-1] // 3)
+        reset, update = projected[..., :two].add_(recurrent[..., :two]).sigmoid_().chunk(2, dim=-1)
+        new = projected[..., two:].add_(recurrent[..., two:].mul_(reset)).tanh_()
+        return torch.lerp(new, carried, update)
+
 
 class GruPolicy(Policy):
     """The paper's policy: a recurrent network whose outputs stay in the parameters' bounds.

@@ -8,6 +8,7 @@ equal.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Literal
 
 import torch
@@ -22,6 +23,13 @@ _BYTES = 16.0
 
 _EDGE = 0.02
 """Least distance to a bound of an untrained network's answer, in unit space."""
+
+
+def _side_by_side(windows: Sequence[Tensor]) -> Tensor:
+    """Returns `(N, B, W, hidden)` of W windows; a single one, as drivers see it, is not copied."""
+    if len(windows) == 1:
+        return windows[0].unsqueeze(2)
+    return torch.stack(list(windows), dim=2)
 
 
 class RecurrentSettings(PolicySettings):
@@ -121,6 +129,21 @@ class RecurrentNetwork(PolicyNetwork):
         logits = torch.baddbmm(self.b_out, self.dropout(x).flatten(1, 2), self.w_out)
         return logits.view(*x.shape[:3], -1).sigmoid(), after
 
+    def act_once(self, tokens: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        x, carried = tokens, []
+        states = state.chunk(len(self.layers), dim=-1)
+        for number, (layer, before) in enumerate(zip(self.layers, states, strict=True)):
+            assert isinstance(layer, RecurrentLayer)
+            projected = torch.baddbmm(layer.b_input, x, layer.w_input)
+            if number == 0 and self.b_acting is not None:
+                projected.add_(self.b_acting[:, 0])
+            recurrent = layer.recur(before[..., : self.hidden])
+            carried.append(self.cell_in_place(projected, recurrent, before))
+            x = carried[-1][..., : self.hidden]
+        logits = torch.baddbmm(self.b_out, self.dropout(x), self.w_out)
+        after = carried[0] if len(carried) == 1 else torch.cat(carried, dim=-1)
+        return logits.sigmoid_(), after
+
     def _recurred(self, tokens: Tensor, state: Tensor, *, acts: bool) -> tuple[Tensor, Tensor]:
         """Returns the outputs of the last layer, `(N, B, W, hidden)`, and the state afterwards."""
         x = tokens
@@ -137,9 +160,10 @@ class RecurrentNetwork(PolicyNetwork):
                 recurrent = layer.recur(carried[..., : self.hidden])
                 carried = self.cell(projected[:, :, k], recurrent, carried)
                 outputs.append(carried[..., : self.hidden])
-            x = torch.stack(outputs, dim=2)
+            x = _side_by_side(outputs)
             last.append(carried)
-        return x, torch.cat(last, dim=-1)
+        after = last[0] if len(last) == 1 else torch.cat(last, dim=-1)
+        return x, after
 
     @staticmethod
     def cell(projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:
@@ -153,3 +177,8 @@ class RecurrentNetwork(PolicyNetwork):
             carried: before the window, `(*batch, states * width)`.
         """
         raise NotImplementedError
+
+    @classmethod
+    def cell_in_place(cls, projected: Tensor, recurrent: Tensor, carried: Tensor) -> Tensor:
+        """As `cell`, to the bits, but may write into the gates: for networks that act at once."""
+        return cls.cell(projected, recurrent, carried)

@@ -95,24 +95,35 @@ class ValidRange(NamedTuple):
             measured.append(_measured(learned.double()))
         return cls(*(torch.stack(column) for column in zip(*measured, strict=True)))
 
-    def score(self, situation: Tensor, network: Tensor) -> Tensor:
+    def of_drivers(self, network: Tensor) -> ValidRange:
+        """Returns the range of each of D drivers' network, `(D,)`: N is D then."""
+        return ValidRange(*(values[network] for values in self))
+
+    def score(self, situation: Tensor, network: Tensor | None = None) -> Tensor:
         """Returns how far outside situations lie, `(D,)`; up to 1 is inside.
 
         Args:
             situation: `(D, f)`.
-            network: whose range each is compared with, `(D,)`.
+            network: whose range each is compared with, `(D,)`; None: each situation has its own.
         """
-        away = situation.to(self.mean) - self.mean[network]
+        if network is not None:
+            return self.of_drivers(network).score(situation)
+        away = situation.to(self.mean) - self.mean
         # Products of matrices, no einsum: what translates an exported graph to C knows hardly any,
         # and of three factors opt_einsum, where it is installed, would fix the number of drivers.
-        turned = torch.matmul(away.unsqueeze(-2), self.precision[network]).squeeze(-2)
+        turned = torch.matmul(away.unsqueeze(-2), self.precision).squeeze(-2)
         squared = torch.matmul(turned.unsqueeze(-2), away.unsqueeze(-1)).squeeze(-1).squeeze(-1)
-        return squared.clamp(min=0.0).sqrt() / self.distance[network]
+        return squared.clamp(min=0.0).sqrt() / self.distance
 
-    def beyond(self, situation: Tensor, network: Tensor) -> Tensor:
-        """Says which signals alone are unusual, bool `(D, 2 f)`: too low, then too high."""
+    def beyond(self, situation: Tensor, network: Tensor | None = None) -> Tensor:
+        """Says which signals alone are unusual, bool `(D, 2 f)`: too low, then too high.
+
+        Arguments as for `score`.
+        """
+        if network is not None:
+            return self.of_drivers(network).beyond(situation)
         value = situation.to(self.mean)
-        return torch.cat([value < self.low[network], value > self.high[network]], -1)
+        return torch.cat([value < self.low, value > self.high], -1)
 
     def joined(self, other: ValidRange) -> ValidRange:
         """Returns one range for what lies in either, by their means and spreads.

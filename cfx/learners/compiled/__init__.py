@@ -6,8 +6,8 @@ The door is `compile_windows` and the two functions that a compiled window has: 
 PyTorch takes the same steps: the eager twin is `cfx.learners.rollout.loop`, and tests hold both
 equal.
 
-Within, from the bottom up: `recording` records an elementwise function, `adjoint` differentiates
-it, `elementwise` writes and builds both as C++; `calls` runs these and matrix products window by
+Within, from the bottom up: `adjoint` differentiates an elementwise function that was recorded,
+`elementwise` writes and builds both as C++; `calls` runs these and matrix products window by
 window (`calls.cpp`). `window` says which functions a window consists of, `forward` simulates a row
 of windows, `backward` goes back through them, and `loop` makes trajectories of it.
 """

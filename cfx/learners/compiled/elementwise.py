@@ -20,9 +20,9 @@ from torch import Tensor
 
 from cfx.core.component import content_key, folder_hash
 from cfx.learners.compiled.adjoint import adjoint
-from cfx.learners.compiled.recording import Program, record_function
 from cfx.simulation.kernel import compiler
 from cfx.simulation.kernel.columns import Unsupported
+from cfx.simulation.kernel.recording import Program, record_function
 from cfx.simulation.kernel.source import head
 
 _BLOCK = 64
@@ -61,7 +61,7 @@ class Elementwise:
     """An elementwise function of tensors in single precision, with its adjoint if that is needed.
 
     Args:
-        function: as for `cfx.learners.compiled.recording.record_function`.
+        function: as for `cfx.simulation.kernel.recording.record_function`.
         inputs: widths of its arguments.
         differentiated: numbers of the arguments by which it is differentiated; empty: none.
         key: what the function depends on besides how it is compiled; None: it is recorded anew in

@@ -7,6 +7,7 @@ such arrays as NumPy does.
 
 from __future__ import annotations
 
+import itertools
 import math
 import operator
 from collections.abc import Callable, Mapping, Sequence
@@ -178,6 +179,23 @@ def _reshape(node: fx.Node, expressions_of: Recorded) -> Expressions:
     return np.asarray(expressions_of[source]).reshape(shape_of(node.meta["val"]))
 
 
+def _bmm(node: fx.Node, expressions_of: Recorded) -> Expressions:
+    """Returns a product of small matrices of each vehicle, `(V, i, j)` by `(V, j, k)`.
+
+    Sums go on from their first product, as PyTorch's of small matrices do.
+    """
+    nodes: Any = node.args
+    left, right = (expressions_of[factor] for factor in nodes)
+    shape = shape_of(node.meta["val"])
+    if left.shape[0] != right.shape[0] or len(shape) != 3:
+        raise Unsupported("a product of matrices that vehicles share")
+    sums = []
+    for _, row, column in itertools.product(*map(range, shape)):
+        products = [f"{a} * {b}" for a, b in zip(left[0, row], right[0, :, column], strict=True)]
+        sums.append(f"({' + '.join(products)})")
+    return array(shape, sums)
+
+
 def _before_vehicles(value: Tensor) -> int | None:
     """Returns how many values lie before the vehicles' dimension; None where there is none."""
     shape = list(value.shape)
@@ -211,11 +229,55 @@ def _gather(node: fx.Node, expressions_of: Recorded) -> Expressions:
     return array(expressions_of[index].shape, columns)
 
 
+def _constant_columns(index: Any) -> list[int]:
+    """Returns the numbers of columns that a constant of the graph lists.
+
+    Raises:
+        Unsupported: they are computed.
+    """
+    while index.op == "call_function" and operation_of(index) == "lift_fresh_copy":
+        index = index.args[0]
+    if index.op != "get_attr":
+        raise Unsupported("a look-up in columns whose numbers are computed")
+    numbers: Tensor = getattr(index.graph.owning_module, str(index.target))
+    return [int(number) for number in numbers.flatten().tolist()]
+
+
+def _index(node: fx.Node, expressions_of: Recorded) -> Expressions:
+    """Returns some of the last dimension's columns, listed by a constant.
+
+    Raises:
+        Unsupported: something else is looked up.
+    """
+    source: Any = node.args[0]
+    indices: Any = node.args[1]
+    *before, last = indices
+    values = expressions_of[source]
+    if any(index is not None for index in before) or len(indices) != values.ndim or not before:
+        raise Unsupported("a look-up along another dimension than the last")
+    return np.asarray(values[..., _constant_columns(last)])
+
+
+def _index_copy(node: fx.Node, expressions_of: Recorded) -> Expressions:
+    """Returns values with other columns in the last dimension, listed by a constant."""
+    arguments: Any = node.args
+    source, _, index, written = arguments
+    copied = np.array(expressions_of[source])
+    if _columns(node, source) % copied.ndim != copied.ndim - 1:
+        raise Unsupported("columns written along another dimension than the last")
+    copied[..., _constant_columns(index)] = expressions_of[written]
+    return copied
+
+
 MOVES: dict[str, Callable[[fx.Node, Recorded], Any]] = {
+    "_unsafe_view": _reshape,
     "arange": _arange,
+    "bmm": _bmm,
     "cat": _cat,
     "gather": _gather,
     "getitem": _getitem,
+    "index": _index,
+    "index_copy": _index_copy,
     "select": _select,
     "slice": _slice,
     "split": _split,

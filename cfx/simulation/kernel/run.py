@@ -102,6 +102,17 @@ def component_code(component: type) -> list[str] | None:
     return names_and_code
 
 
+def step_key(model: DrivingModel) -> list[object] | None:
+    """Returns what a step of a model depends on, as JSON knows it, for `row_function`.
+
+    It is None where other processes could not know it, as of a class made inside a function.
+    """
+    code = component_code(type(model))
+    if code is None:
+        return None
+    return [code, model.identity(), folder_hash(step.__file__)]
+
+
 _KERNELS: dict[KernelKey, _Kernel | None] = {}
 _MAKING = threading.Lock()
 

@@ -27,6 +27,7 @@ from cfx.policies.features import Scaler
 from cfx.policies.heads.base import DirectHead
 from cfx.policies.heads.offset import shrunk
 from cfx.policies.population import DriverPopulation
+from cfx.policies.row_choice import DriverRows, RowChoice
 from cfx.policies.valid_range import ValidRange
 from cfx.simulation.rollout import MemoryStepper
 from cfx_sumo.demo.motorway import read_motorway
@@ -43,16 +44,16 @@ from tests.road import Car, Road, platoon
 pytest.importorskip("traci", reason="needs the extra sumo")
 
 
-def counted(policy: Agent, monkeypatch: pytest.MonkeyPatch) -> list[int]:
+def counted(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Returns a list that grows by the number of drivers at each call of the policy."""
     calls: list[int] = []
-    original = Agent.act
+    original = RowChoice.act
 
-    def act(self: Agent, history: Any, state: Any, **options: Any) -> tuple[Tensor, Any]:
-        calls.append(len(history["gap"]))
-        return original(self, history, state, **options)
+    def act(self: RowChoice, drivers: DriverRows, rows: Tensor, noise: Any = None) -> None:
+        calls.append(len(rows))
+        original(self, drivers, rows, noise)
 
-    monkeypatch.setattr(Agent, "act", act)
+    monkeypatch.setattr(RowChoice, "act", act)
     return calls
 
 
@@ -62,7 +63,7 @@ def test_all_vehicles_are_one_call_of_the_policy_and_windows_are_each_vehicles_o
     road = platoon(300)
     late = [f"v{i}" for i in range(200, 300)]
     driver = Driver(adaptive({"name": "w99"}))
-    calls = counted(driver.policy, monkeypatch)
+    calls = counted(monkeypatch)
     for k in range(11):
         driver.step(
             road, [name for name in road.cars if name != "lead" and (k >= 2 or name not in late)]
@@ -602,7 +603,7 @@ def test_a_fleet_drives_each_type_by_its_own_and_finds_who_comes(
         ["calm", "normal", "hasty", "calm@v3", "other", "hasty", "normal", "calm", "calm"]
     ):
         road.cars[f"v{i}"].kind = kind
-    calls = counted(fleet.drivers["calm"].policy, monkeypatch)
+    calls = counted(monkeypatch)
     fleet.step(road)
     assert sorted(calls) == [2, 6]
     assert {name for name, kind in fleet.vehicles.items() if kind == "calm"} == {

@@ -33,7 +33,7 @@ from cfx_sumo.installed import require_sumo
 from cfx_sumo.live.driver import Driver, DriverOptions
 from cfx_sumo.live.fleet import Fleet
 from cfx_sumo.live.histories import WALKING_MPS
-from cfx_sumo.live.surroundings import View
+from cfx_sumo.live.surroundings import View, lanes_of
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -72,7 +72,8 @@ class Histogram:
         array = np.asarray(values, dtype=np.float64)
         array = array[np.isfinite(array)]
         places = ((array - self.low) / self.width).astype(np.int64)
-        np.add.at(self.counts, places.clip(0, len(self.counts) - 1), 1)
+        last = len(self.counts) - 1
+        self.counts += np.bincount(places.clip(0, last), minlength=last + 1)
 
     def quantile(self, share: float) -> float:
         """Returns the value below which this share lies, to half a bin; NaN if there is none."""
@@ -579,6 +580,7 @@ class _Run:
         self._collisions: list[Collision] = []
         self._touching: dict[tuple[str, str], Collision] = {}
         self._decel: dict[str, float] = {}
+        self._least_decel: dict[str, float] = {}
         self._steps = 0
         self._others = 0
         self._most = 0
@@ -689,6 +691,7 @@ class _Run:
             self._type_of |= vehicles
             for kind, names in self._names.items():
                 self._tallies[kind].vehicles.update(names)
+                self._least_decel[kind] = min(self._own_decel(name) for name in names)
         for kind, names in self._names.items():
             self._count(kind, names, dt)
         self._count_lanes(vehicles)
@@ -720,7 +723,9 @@ class _Run:
         tally.braking.add((-acceleration).clip(min=0.0))
         tally.time_gaps.add(motions.time_gaps)
         brakes = set()
-        for number in (acceleration < 0.0).nonzero()[0].tolist():
+        # Whoever brakes no harder than the least `decel` of all need not be looked at.
+        least = self._least_decel[kind]
+        for number in (acceleration < -least - 1e-6).nonzero()[0].tolist():
             name = motions.names[number]
             if acceleration[number] < -self._own_decel(name) - 1e-6:
                 brakes.add(name)
@@ -736,9 +741,9 @@ class _Run:
         again only then, or where vehicles of other vTypes have the same driver.
         """
         view = driver.looked_at()
-        if view is not None and len(view.order) == len(names):
-            looked = [*view.following, *view.alone]
-            if set(looked) == set(names):
+        if view is not None and len(view.names) == len(names):
+            looked = view.names
+            if view.arrangement.asked == names or set(looked) == set(names):
                 return _Motions.of_view(looked, view)
         vehicle = self._sumo.vehicle
         motions = []
@@ -754,16 +759,16 @@ class _Run:
         if now < self._lanes_next - 1e-6:
             return
         self._lanes_next = now + _LANES_EVERY_S
-        lane_of, lanes, before = self._sumo.vehicle.getLaneID, {}, self._lanes
-        for name, kind in vehicles.items():
-            lanes[name] = lane = lane_of(name)
+        names = list(vehicles)
+        lanes, before = dict(zip(names, lanes_of(self._sumo, names), strict=True)), self._lanes
+        for name, lane in lanes.items():
             last = before.get(name, lane)
             if lane == last:
                 continue
             edge, _, index = lane.rpartition("_")
             last_edge, _, last_index = last.rpartition("_")
             if edge and edge == last_edge:
-                self._tallies[kind].lane_changes += abs(int(index) - int(last_index))
+                self._tallies[vehicles[name]].lane_changes += abs(int(index) - int(last_index))
         self._lanes = lanes
 
     def _own_decel(self, name: str) -> float:

@@ -28,28 +28,33 @@ _GETTERS = tuple(
     f"_ZN7libsumo7Vehicle{len(name)}{name}E{_TEXT}"
     for name in ("getSpeed", "getAcceleration", "getMinGap", "getAllowedSpeed")
 )
+_LANE = f"_ZN7libsumo7Vehicle9getLaneIDE{_TEXT}"
 _SETTER = f"_ZN7libsumo7Vehicle8setSpeedE{_TEXT}d"
 
+_SIGNALS = 7
+"""Of a vehicle that are read."""
+
 _ROOM = 256
-"""Bytes for the name of a leader who is not among the vehicles that are read, on average."""
+"""Bytes for a word of a vehicle, such as its lane, on average."""
 
 
 class Read(NamedTuple):
     """What SUMO says of D vehicles.
 
     Attributes:
-        rows: place of each vehicle's leader among them, `(D,)` int64; -1: it is another vehicle;
-            -2: there is none.
-        others: names of those other leaders, in order.
-        motions: their speeds and accelerations, `(others, 2)`, SI units.
-        values: gap to the leader without `minGap`, speed, acceleration, `minGap` and allowed
-            speed, `(D, 5)`, SI units.
+        at: place of the next vehicle ahead of each among them, `(D,)` int64; -1: it is another
+            vehicle; -2: there is none.
+        others: those other vehicles, in order.
+        follows: which of them have a leader, bool `(D,)`.
+        signals: what they and their leaders do, `(7, D)`, in the order of `Seen`.
+        unchanged: whether `at` and `follows` are those of the reading before.
     """
 
-    rows: NDArray[np.int64]
+    at: NDArray[np.int64]
     others: list[str]
-    motions: NDArray[np.float64]
-    values: NDArray[np.float64]
+    follows: NDArray[np.bool_]
+    signals: NDArray[np.float64]
+    unchanged: bool = False
 
 
 class Bridge:
@@ -68,41 +73,63 @@ class Bridge:
         self._leader = _address(libsumo, _LEADER)
         addresses = [_address(libsumo, name) for name in _GETTERS]
         self._getters = (ctypes.c_void_p * len(addresses))(*addresses)
+        self._lane = _address(libsumo, _LANE)
         self._setter = _address(libsumo, _SETTER)
-        self._rows = np.empty(0, dtype=np.int64)
-        compiled.cfx_read.restype = compiled.cfx_tell.restype = ctypes.c_int64
+        self._text_room = np.empty(0, dtype=np.uint8)
+        self._names: Sequence[str] = []
+        self._text = b""
+        for function in (compiled.cfx_read, compiled.cfx_words, compiled.cfx_tell):
+            function.restype = ctypes.c_int64
 
-    def read(self, names: Sequence[str], reach: float) -> Read | None:
+    def read(
+        self, names: Sequence[str], reach: float, free_road: float, before: Read | None = None
+    ) -> Read | None:
         """Reads vehicles and who is ahead of them; None where SUMO does not know one of them.
 
         Args:
             names: D vehicles.
             reach: m, within which a leader counts.
+            free_road: m: the gap of vehicles without a leader.
+            before: of an instant ago, of as many vehicles; where leaders were then is looked first.
         """
         count = len(names)
-        values = np.empty((count, 5))
-        # Where leaders were at the last read: a hint, which the compiled function checks.
-        rows = np.full(count, -2, dtype=np.int64)
-        rows[: len(self._rows)] = self._rows[:count]
-        motions = np.empty((count, 2))
-        others = ctypes.create_string_buffer(_ROOM * count + _ROOM)
+        signals = np.empty((_SIGNALS, count))
+        if before is None or len(before.at) != count:
+            at, follows = np.full(count, -2, dtype=np.int64), np.zeros(count, dtype=np.bool_)
+        else:
+            at, follows = before.at.copy(), before.follows.copy()
+        text = self._room_for(count)
+        changes = ctypes.c_int64(0)
         length = self._compiled.cfx_read(
             ctypes.c_void_p(self._leader),
             self._getters,
             ctypes.c_int64(count),
-            _joined(names),
+            self._joined(names),
             ctypes.c_double(reach),
-            values.ctypes.data_as(ctypes.c_void_p),
-            rows.ctypes.data_as(ctypes.c_void_p),
-            others,
-            motions.ctypes.data_as(ctypes.c_void_p),
-            ctypes.c_int64(len(others)),
+            ctypes.c_double(free_road),
+            ctypes.c_void_p(signals.ctypes.data),
+            ctypes.c_void_p(at.ctypes.data),
+            ctypes.c_void_p(follows.ctypes.data),
+            ctypes.c_void_p(text.ctypes.data),
+            ctypes.c_int64(len(text)),
+            ctypes.byref(changes),
         )
         if length < 0:
             return None
-        self._rows = rows
-        found = others.raw[:length].decode().split("\0")[:-1]
-        return Read(rows, found, motions[: len(found)], values)
+        others = _words(text[:length])
+        return Read(at, others, follows, signals, before is not None and changes.value == 0)
+
+    def lanes(self, names: Sequence[str]) -> list[str] | None:
+        """Returns the lane of each vehicle; None where SUMO does not know one of them."""
+        text = self._room_for(len(names))
+        length = self._compiled.cfx_words(
+            ctypes.c_void_p(self._lane),
+            ctypes.c_int64(len(names)),
+            self._joined(names),
+            ctypes.c_void_p(text.ctypes.data),
+            ctypes.c_int64(len(text)),
+        )
+        return None if length < 0 else _words(text[:length])
 
     def set_speeds(self, names: Sequence[str], speeds: NDArray[np.float64]) -> int:
         """Tells SUMO the next speeds of vehicles, m/s; returns how many it took."""
@@ -110,10 +137,22 @@ class Bridge:
         count: int = self._compiled.cfx_tell(
             ctypes.c_void_p(self._setter),
             ctypes.c_int64(len(names)),
-            _joined(names),
-            told.ctypes.data_as(ctypes.c_void_p),
+            self._joined(names),
+            ctypes.c_void_p(told.ctypes.data),
         )
         return count
+
+    def _room_for(self, count: int) -> NDArray[np.uint8]:
+        """Returns room for a word of each of so many vehicles, which is used again."""
+        if len(self._text_room) < _ROOM * (count + 1):
+            self._text_room = np.empty(2 * _ROOM * (count + 1), dtype=np.uint8)
+        return self._text_room
+
+    def _joined(self, names: Sequence[str]) -> bytes:
+        """Returns names that each end with 0; mostly they are those of the last call."""
+        if names is not self._names:
+            self._names, self._text = names, "\0".join(names).encode() + b"\0"
+        return self._text
 
 
 def bridge_of(vehicle: Any) -> Bridge | None:
@@ -146,6 +185,8 @@ def _address(library: ctypes.CDLL, name: str) -> int:
     return address
 
 
-def _joined(names: Sequence[str]) -> bytes:
-    """Returns names that each end with 0."""
-    return "\0".join(names).encode() + b"\0"
+def _words(text: NDArray[np.uint8]) -> list[str]:
+    """Returns the words of a text, each of which ends with 0."""
+    if len(text) == 0:
+        return []
+    return text.tobytes().decode().split("\0")[:-1]

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.plugin import Agent, valid_range
@@ -38,26 +41,40 @@ class DriveCounts:
     limited: int = 0
     beyond: Tensor | None = None
 
-    def add(self, score: Tensor, beyond: Tensor) -> None:
-        """Counts one step of D vehicles: scores `(D,)`, unusual signals `(D, 2 f)`."""
-        is_outside = score > 1.0
+    def add(self, score: NDArray[np.float64], beyond: Tensor, rows: Tensor) -> None:
+        """Counts one step of D vehicles.
+
+        Args:
+            score: of each, `(D,)`.
+            beyond: unusual signals of all rows of a table, `(C, 2 f)`.
+            rows: of the vehicles, `(D,)` int64.
+        """
         self.steps += len(score)
-        self.outside += int(is_outside.sum())
-        unusual = beyond[is_outside].sum(0)
+        outside = np.flatnonzero(score > 1.0)
+        if len(outside) == 0 and self.beyond is not None:
+            return
+        self.outside += len(outside)
+        unusual = beyond[rows[torch.from_numpy(outside)]].sum(0)
         self.beyond = unusual if self.beyond is None else self.beyond + unusual
 
-    def add_told(self, told: Tensor, speed: Tensor, going: Tensor) -> None:
+    def add_told(
+        self, told: NDArray[np.float64], speed: NDArray[np.float64], going: Tensor | None
+    ) -> None:
         """Counts what became of the speeds that SUMO was told.
 
         Args:
             told: `(D,)`, m/s; NaN where SUMO was told none.
             speed: that vehicles have, `(D,)`, m/s.
-            going: which vehicles were told one step ago, bool `(D,)`.
+            going: which vehicles were told one step ago, bool `(D,)`; None: all.
         """
-        obliged = going & ~told.isnan()
-        changed = (speed - told).abs() > _OBEYED_MPS
-        self.told += int(obliged.sum())
-        self.changed += int((obliged & changed).sum())
+        changed = np.abs(speed - told) > _OBEYED_MPS
+        if going is None:
+            self.told += len(told)
+            self.changed += int(np.count_nonzero(changed))
+            return
+        obliged = going.numpy() & ~np.isnan(told)
+        self.told += int(np.count_nonzero(obliged))
+        self.changed += int(np.count_nonzero(obliged & changed))
 
     def outside_in_words(self, policy: Agent) -> str:
         """Returns how much was driven outside what the policy has learned, in words; or ""."""

@@ -14,11 +14,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
 from itertools import compress
 from pathlib import Path
 from typing import TypedDict, Unpack, cast
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.errors import DataError, SumoError
@@ -46,6 +49,9 @@ from cfx_sumo.live.windows import PolicyWindows
 
 _BOUNDS_BRAKING = 4
 """Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""
+
+_Floats = NDArray[np.float64]
+_Places = NDArray[np.int64]
 
 Together = dict[tuple[int, int], dict[str, float]]
 """Speeds of vehicles, m/s, that drivers of one simulation expect within a step of it: by how many
@@ -76,6 +82,33 @@ class DriverOptions(TypedDict, total=False):
     average: bool
 
 
+@dataclass(frozen=True)
+class LastDrive:
+    """What the last call drove, if it drove all vehicles that it was given.
+
+    Mostly the next call is one period later and for the same vehicles, behind the same leaders.
+    Then nobody begins anew, and all were told a speed.
+
+    Attributes:
+        view: of the vehicles; None: there was no such call.
+        rows: theirs, `(D,)` int64, in the view's order.
+        time: s.
+    """
+
+    view: View | None = None
+    rows: Tensor = field(default_factory=lambda: torch.empty(0, dtype=torch.int64))
+    time: float = math.nan
+
+    def goes_on(self, names: list[str], now: float, clock: Clock) -> bool:
+        """Says whether the same vehicles are driven one period later; a list of them is kept."""
+        is_next = abs(now - self.time - clock.period) < 0.5 * clock.dt
+        return self.view is not None and is_next and self.view.arrangement.asked is names
+
+    def is_arranged(self, view: View) -> bool:
+        """Says whether everybody is still behind the same leader."""
+        return self.view is not None and self.view.arrangement is view.arrangement
+
+
 class Driver:
     """Drives any number of vehicles with the policy of one job.
 
@@ -86,8 +119,9 @@ class Driver:
     Life cycle of a vehicle: it is driven from the first `step` that names it. Behind a leader the
     policy sees the last L frames of that vehicle and of its leader, the first frame standing for
     those before, and chooses parameters every `windows.stride` steps *of that vehicle*. Vehicles
-    whose window begins are one batch. That is the closed loop in which cfx evaluates a policy, to
-    the last bits. A vehicle that was not stepped one time step ago, or had no leader, begins anew.
+    whose window begins are one batch. That is the closed loop in which cfx evaluates a policy; what
+    is compiled rounds exponentials and powers otherwise in their last bits. A vehicle that was not
+    stepped one time step ago, or had no leader, begins anew.
 
     Without a leader within `look_ahead` the policy's own model drives with the parameters to which
     the policy fades outside what it has learned, to the lane's limit: a car-following policy has
@@ -177,6 +211,7 @@ class Driver:
         self._now = -math.inf
         self._clock: Clock | None = None
         self._view: View | None = None
+        self._last = LastDrive()
 
     @classmethod
     def load(
@@ -384,21 +419,33 @@ class Driver:
         self._now = now
         self._forget_departed(connection, now)
         self._let_go(connection, names if drive else [], names, is_new=is_new)
-        rows = self._rows_for(connection, names, now)
-        times = self._vehicles.table.time[rows]
-        early = now - times < clock.period - 0.5 * clock.dt
+        names, rows = self._rows_for(connection, names, now)
         between: list[str] = []
-        if bool(early.any()):
-            between = list(compress(names, (early & (times != now)).tolist()))
-            names, rows = list(compress(names, (~early).tolist())), rows[~early]
-        view = look(connection, names, self.look_ahead)
+        if not self._last.goes_on(names, now, clock):
+            names, between, rows = self._due(names, rows, now, clock)
+        view = look(connection, names, self.look_ahead, self._last.view)
         self._view = view if drive and not between else None
-        rows = rows[view.order]
-        if drive:
-            self._hold(connection, between, now, clock)
-            yield from self._drive(connection, view, rows, now, clock, together)
-        else:
-            self._watch(connection, view, rows, now, clock)
+        if not drive:
+            self._last = LastDrive()
+            self._watch(connection, view, rows[view.arrangement.order], now, clock)
+            return
+        self._hold(connection, between, now, clock)
+        yield from self._drive(connection, view, rows, now, clock, together)
+
+    def _due(
+        self, names: list[str], rows: Tensor, now: float, clock: Clock
+    ) -> tuple[list[str], list[str], Tensor]:
+        """Leaves vehicles out whose time has not come, in steps shorter than the model's.
+
+        Returns:
+            Those whose time has come, those that go on meanwhile, and the rows of the first.
+        """
+        times = self._vehicles.table.time.numpy()[rows.numpy()]
+        early = now - times < clock.period - 0.5 * clock.dt
+        if not early.any():
+            return names, [], rows
+        between = list(compress(names, (early & (times != now)).tolist()))
+        return list(compress(names, (~early).tolist())), between, rows[torch.from_numpy(~early)]
 
     def _hold(self, connection: Connection, names: list[str], now: float, clock: Clock) -> None:
         """Lets vehicles go on as they accelerate, in the steps between two of the model."""
@@ -420,50 +467,98 @@ class Driver:
         together: Together | None,
     ) -> Iterator[None]:
         """Lets the model take its steps until the next look, and tells SUMO where they lead."""
-        names = [*view.following, *view.alone]
+        names, count = view.names, len(view.following)
         if not names:
             self._control.bound_braking(connection, names, {})
             return
-        count = len(view.following)
-        table, following = self._vehicles.table, rows[:count]
-        going = self._histories.goes_on(rows, now, clock)
-        self.counts.add_told(table.told[rows], view.seen.speed, going)
-        seen = self._remember(following, view, now, clock)
-        self._begin_free(rows[count:], view.alone, now, clock)
-        self._take_over(connection, names, rows, seen, clock)
-        first, hardest = seen.speed, torch.zeros_like(seen.speed)
+        table, (rows, seen) = (
+            self._vehicles.table,
+            self._take_up(connection, view, rows, now, clock),
+        )
+        following, at = rows[:count], rows.numpy()
+        first = speed = seen.speed.numpy()
+        hardest = np.zeros_like(first)
         for number in range(clock.substeps):
             if number > 0:
-                self._histories.append(following, seen.rows(slice(count)))
+                self._histories.append(following, seen)
             self._windows.choose(following, view.following, now + number * clock.step, clock)
-            table.steps[following] += 1
-            self.counts.add(table.score[following], table.beyond[following])
-            speed, bound = self._model_steps.take(connection, names, rows, seen, clock.step)
-            self.counts.limited += self._model_steps.count_limited(
-                seen.speed[:count], speed[:count], clock.step
-            )
-            hardest = torch.maximum(hardest, bound)
-            leaders = None
-            if clock.substeps > 1:
-                others: dict[str, float] = {}
-                if together is not None:
-                    others = together.setdefault((clock.substeps, number), {})
-                    others.update(zip(names, speed.tolist(), strict=True))
-                    yield
-                leaders = view.leader_speeds(speed, others)
-            seen = seen.one_step_later(speed, clock.step, leaders)
+            table.steps.numpy()[at[:count]] += 1
+            self.counts.add(table.score.numpy()[at[:count]], table.beyond, following)
+            taken = self._model_steps.take(connection, names, rows, seen, clock.step)
+            speed = taken.speed
+            self.counts.limited += int(np.count_nonzero(taken.is_limited[:count]))
+            if taken.bound is not None:
+                hardest = np.maximum(hardest, taken.bound)
+            if clock.substeps == 1:
+                break
+            after, others = torch.from_numpy(speed), dict[str, float]()
+            if together is not None:
+                others = together.setdefault((clock.substeps, number), {})
+                others.update(zip(names, speed.tolist(), strict=True))
+                yield
+            seen = seen.one_step_later(after, clock.step, view.leader_speeds(after, others))
+        if clock.substeps > 1:
+            table.expected[rows] = frame_of(seen)
         self.counts.free += clock.substeps * len(view.alone)
-        table.expected[rows] = frame_of(seen)
-        table.start[rows], table.ramp[rows] = first, (seen.speed - first) / clock.period
-        told = seen.speed
+        self._tell(connection, names, at, first, speed, hardest, clock)
+        self._last = LastDrive(view, rows, now)
+
+    def _take_up(
+        self, connection: Connection, view: View, rows: Tensor, now: float, clock: Clock
+    ) -> tuple[Tensor, Seen]:
+        """Puts what was seen into the vehicles' rows, and begins those that are new.
+
+        Returns:
+            The rows in the view's order, `(D,)` int64, and what all vehicles do.
+        """
+        table, last, count = self._vehicles.table, self._last, len(view.following)
+        unchanged = last.goes_on(view.arrangement.asked, now, clock) and last.is_arranged(view)
+        rows = last.rows if unchanged else rows[view.arrangement.order]
+        # Until all is done nothing is known of this call: it may end in an error.
+        self._last = LastDrive()
+        going = None
+        if not unchanged:
+            going = self._histories.goes_on(rows, now, clock)
+        self.counts.add_told(table.told.numpy()[rows.numpy()], view.seen.speed.numpy(), going)
+        seen = self._remember(rows[:count], view, going, now, clock)
+        if view.alone:
+            self._begin_free(rows[count:], view.alone, going, now)
+        if not unchanged:
+            self._take_over(connection, view.names, rows, seen, clock)
+        return rows, seen
+
+    def _tell(
+        self,
+        connection: Connection,
+        names: list[str],
+        at: _Places,
+        first: _Floats,
+        speed: _Floats,
+        hardest: _Floats,
+        clock: Clock,
+    ) -> None:
+        """Tells SUMO the next speeds of vehicles, and how hard they must be able to brake.
+
+        Args:
+            connection: to the simulation.
+            names: the D vehicles.
+            at: their rows, `(D,)`.
+            first: their speeds now, `(D,)`, m/s.
+            speed: those at the next look, `(D,)`, m/s.
+            hardest: how hard they must be able to brake, `(D,)`, m/s2; 0: comfortably is enough.
+            clock: of the simulation.
+        """
+        table, ramp = self._vehicles.table, (speed - first) / clock.period
+        table.start.numpy()[at], table.ramp.numpy()[at] = first, ramp
+        told = speed
         if clock.held > 1:
-            told = first + table.ramp[rows] * clock.dt
-        table.told[rows] = told
-        brakes_hard = {}
-        for index in hardest.nonzero().flatten().tolist():
+            told = first + ramp * clock.dt
+        table.told.numpy()[at] = told
+        brakes_hard: dict[str, float] = {}
+        for index in np.flatnonzero(hardest).tolist():
             brakes_hard[names[index]] = float(hardest[index])
         self._control.bound_braking(connection, names, brakes_hard)
-        set_speeds(connection, names, told.numpy())
+        set_speeds(connection, names, told)
 
     def _watch(
         self, connection: Connection, view: View, rows: Tensor, now: float, clock: Clock
@@ -475,7 +570,8 @@ class Driver:
             return
         count = len(view.following)
         rows = rows[:count]
-        seen = self._remember(rows, view, now, clock).rows(slice(count))
+        going = self._histories.goes_on(rows, now, clock)
+        seen = self._remember(rows, view, going, now, clock).rows(slice(count))
         table = self._vehicles.table
         for number in range(clock.substeps):
             if number > 0:
@@ -486,29 +582,41 @@ class Driver:
             seen = seen.one_step_later(speed, clock.step)
         table.expected[rows] = frame_of(seen)
 
-    def _remember(self, rows: Tensor, view: View, now: float, clock: Clock) -> Seen:
+    def _remember(
+        self, rows: Tensor, view: View, going: Tensor | None, now: float, clock: Clock
+    ) -> Seen:
         """Puts this instant into the histories of followers; begins those that are new.
 
         Args:
             rows: of the F followers, who stand first in the view.
             view: all D vehicles.
+            going: which of the D vehicles were looked at one period ago, bool `(D,)`; None: all,
+                and followers were followers.
             now: s.
             clock: of the simulation.
 
         Returns:
             What all D vehicles do, with accelerations as over a step of the model.
         """
-        seen, new = self._histories.remember(rows, view, now, clock)
+        seen, new = self._histories.remember(rows, view, going, now, clock)
         if len(new) > 0:
             self._windows.begin(rows[new], [view.following[number] for number in new.tolist()])
         return seen
 
-    def _begin_free(self, rows: Tensor, names: list[str], now: float, clock: Clock) -> None:
-        """Begins vehicles that have no leader any more, or have just come."""
+    def _begin_free(self, rows: Tensor, names: list[str], going: Tensor | None, now: float) -> None:
+        """Begins vehicles that have no leader any more, or have just come.
+
+        Args:
+            rows: of the vehicles, `(A,)` int64.
+            names: their ids.
+            going: as for `_remember`; these are the last of the D vehicles.
+            now: s.
+        """
         table = self._vehicles.table
-        stays_free = self._histories.goes_on(rows, now, clock) & table.free[rows]
-        new = (~stays_free).nonzero().flatten()
         table.time[rows] = now
+        if going is None:
+            return
+        new = (~(going[-len(rows) :] & table.free[rows])).nonzero().flatten()
         if len(new) == 0:
             return
         beginning = [names[number] for number in new.tolist()]
@@ -521,7 +629,7 @@ class Driver:
     ) -> None:
         """Drives from here on the vehicles that begin, with a new window and memory."""
         table = self._vehicles.table
-        for index in (~table.driven[rows]).nonzero().flatten().tolist():
+        for index in np.flatnonzero(~table.driven.numpy()[rows.numpy()]).tolist():
             name, row = names[index], int(rows[index])
             acts = connection.vehicle.getActionStepLength(name)
             if acts > clock.dt + 1e-6:
@@ -649,6 +757,7 @@ class Driver:
             self.forget(vehicle)
         self._swept = math.nan
         self._clock = None
+        self._last = LastDrive()
         self._roster.clear()
 
     def release(self, connection: Connection, vehicle: str) -> None:
@@ -708,8 +817,10 @@ class Driver:
             if row is not None and float(self._vehicles.table.time[row]) != now:
                 self.forget(name)
 
-    def _rows_for(self, connection: Connection, names: list[str], now: float) -> Tensor:
-        """Returns the rows of vehicles, `(D,)` int64, and drops those that have left."""
+    def _rows_for(
+        self, connection: Connection, names: list[str], now: float
+    ) -> tuple[list[str], Tensor]:
+        """Returns vehicles and their rows, `(D,)` int64, and drops those that have left."""
         if not self._vehicles.were_last(names) or len(names) != len(self._vehicles.names):
             self._forget_gone(connection, names, now)
         return self._vehicles.rows_again(names)

@@ -5,12 +5,11 @@ Shapes: D vehicles.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.errors import SumoError
@@ -77,28 +76,99 @@ _SUBSCRIBED = (_SPEED, _ACCELERATION, _ALLOWED_SPEED, _MIN_GAP)
 """What is subscribed to, besides the leader."""
 
 _ANOTHER, _NOBODY = -1, -2
-"""Rows of a leader who is not among the vehicles that are read, and of none."""
+"""Places of a leader who is not among the vehicles that are read, and of none."""
+
+
+class Arrangement(NamedTuple):
+    """Who is ahead of whom; mostly the same as an instant ago.
+
+    Attributes:
+        asked: the D vehicles that were asked for.
+        read: what was read of them as they were arranged so.
+        following: those with a leader, F of them.
+        leaders: their leaders.
+        alone: vehicles without a leader.
+        rows: of the leaders among the D vehicles, those that follow first, `(D,)` int64; below 0:
+            another vehicle, or none.
+        order: which of the vehicles that were asked for each is, `(D,)` int64.
+    """
+
+    asked: list[str]
+    read: Read
+    following: list[str]
+    leaders: list[str]
+    alone: list[str]
+    rows: Tensor
+    order: Tensor
+
+    @classmethod
+    def of(cls, names: list[str], read: Read) -> Arrangement:
+        """Arranges vehicles, those that follow first."""
+        order = np.argsort(~read.follows, kind="stable")
+        count = int(np.count_nonzero(read.follows))
+        following, alone = names, list[str]()
+        if count < len(names):
+            placed = np.array(names, dtype=object)[order].tolist()
+            following, alone = placed[:count], placed[count:]
+        ahead = np.array([*names, "", ""], dtype=object)[read.at]
+        ahead[read.at == _ANOTHER] = read.others
+        place = np.empty_like(order)
+        place[order] = np.arange(len(order))
+        is_among = read.follows & (read.at >= 0)
+        among = np.where(is_among, place.take(read.at, mode="clip"), _ANOTHER)[order]
+        return cls(
+            asked=names,
+            read=read,
+            following=following,
+            leaders=ahead[order[:count]].tolist(),
+            alone=alone,
+            rows=torch.from_numpy(among),
+            order=torch.from_numpy(order),
+        )
+
+    def is_still(self, names: list[str], read: Read) -> bool:
+        """Says whether vehicles are arranged like this."""
+        if self.asked != names or self.read.others != read.others:
+            return False
+        return read.unchanged or (
+            np.array_equal(self.read.at, read.at)
+            and np.array_equal(self.read.follows, read.follows)
+        )
 
 
 class View(NamedTuple):
     """Vehicles and who is ahead of them.
 
     Attributes:
-        following: vehicles with a leader, F of them.
-        leaders: their leaders.
-        alone: vehicles without a leader.
-        seen: what all D do, those with a leader first. The others have a leader that is as fast as
-            they are, a thousand kilometres ahead.
-        rows: of the leaders among the D vehicles, `(D,)` int64; below 0: another vehicle, or none.
-        order: which of the vehicles that were asked for each is, `(D,)` int64.
+        arrangement: who is ahead of whom; the same object as before where nothing has changed.
+        seen: what all D vehicles do, those with a leader first. The others have a leader that is as
+            fast as they are, a thousand kilometres ahead.
     """
 
-    following: list[str]
-    leaders: list[str]
-    alone: list[str]
+    arrangement: Arrangement
     seen: Seen
-    rows: Tensor
-    order: Tensor
+
+    @property
+    def following(self) -> list[str]:
+        """Vehicles with a leader, F of them."""
+        return self.arrangement.following
+
+    @property
+    def leaders(self) -> list[str]:
+        """Their leaders."""
+        return self.arrangement.leaders
+
+    @property
+    def alone(self) -> list[str]:
+        """Vehicles without a leader."""
+        return self.arrangement.alone
+
+    @property
+    def names(self) -> list[str]:
+        """All D vehicles, in the order of `seen`."""
+        if not self.alone:
+            return self.following
+        return [*self.following, *self.alone]
 
     def leader_speeds(self, speed: Tensor, others: Mapping[str, float]) -> Tensor:
         """Returns the speeds of leaders that are driven too, `(D,)`, m/s; NaN of other leaders.
@@ -107,61 +177,62 @@ class View(NamedTuple):
             speed: of the D vehicles, `(D,)`, m/s.
             others: of vehicles that other drivers drive, by their ids.
         """
-        known = torch.where(self.rows < 0, torch.nan, speed[self.rows])
+        rows = self.arrangement.rows
+        known = torch.where(rows < 0, torch.nan, speed[rows])
         if others:
-            for row in (self.rows[: len(self.leaders)] < 0).nonzero().flatten().tolist():
+            for row in (rows[: len(self.leaders)] < 0).nonzero().flatten().tolist():
                 known[row] = others.get(self.leaders[row], torch.nan)
         return known
 
 
-def look(connection: Connection, names: list[str], look_ahead: float) -> View:
+def look(
+    connection: Connection, names: list[str], look_ahead: float, before: View | None = None
+) -> View:
     """Reads vehicles and their leaders.
 
     Args:
         connection: to the simulation.
         names: the vehicles.
         look_ahead: m; a vehicle farther ahead is no leader.
+        before: what was seen an instant ago, of whatever vehicles.
 
     Raises:
         SumoError: a vehicle is not in the simulation.
     """
     vehicle = connection.vehicle
     if type(vehicle).__module__.startswith("traci"):
-        return view_of(SubscribedReader(vehicle, ("d", look_ahead)), names, look_ahead)
+        return view_of(SubscribedReader(vehicle, ("d", look_ahead)), names, look_ahead, before)
     bridge = bridge_of(vehicle)
     if bridge is not None:
-        read = bridge.read(names, look_ahead)
+        last = None if before is None else before.arrangement
+        is_same = last is not None and last.asked == names
+        read = bridge.read(
+            names, look_ahead, FREE_ROAD_M, last.read if last is not None and is_same else None
+        )
         if read is not None:
-            motions = dict(zip(read.others, read.motions.tolist(), strict=True))
-            return _view(names, _columns_of(names, read), motions.__getitem__, look_ahead)
-    return view_of(DirectReader(vehicle, look_ahead), names, look_ahead)
+            return _arranged(names, read, before)
+    return view_of(DirectReader(vehicle, look_ahead), names, look_ahead, before)
 
 
-class Columns(NamedTuple):
-    """What SUMO says of D vehicles.
-
-    Attributes:
-        ahead: the next vehicle ahead of each, `(D,)`; "" where there is none.
-        rows: places of those among the D vehicles, `(D,)`; -1: it is another; -2: there is none.
-        values: gap to it without `minGap`, speed, acceleration, `minGap` and allowed speed,
-            `(5, D)`, SI units, as TraCI's getters answer.
-    """
-
-    ahead: NDArray[np.object_]
-    rows: NDArray[np.int64]
-    values: NDArray[np.float64]
+def lanes_of(connection: Connection, names: Sequence[str]) -> list[str]:
+    """Returns the lane of each vehicle, by SUMO's ids."""
+    bridge = bridge_of(connection.vehicle)
+    if bridge is not None:
+        lanes = bridge.lanes(names)
+        if lanes is not None:
+            return lanes
+    return [connection.vehicle.getLaneID(name) for name in names]
 
 
-def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahead: float) -> View:
+def view_of(
+    reader: DirectReader | SubscribedReader,
+    names: list[str],
+    look_ahead: float,
+    before: View | None = None,
+) -> View:
     """Reads vehicles and their leaders in one of the two ways; as `look`."""
     try:
-        rows = [reader.row(name) for name in names]
-        ahead = [leader[0] if leader else "" for leader, *_ in rows]
-        values = np.array([(leader[1] if leader else np.inf, *row) for leader, *row in rows])
-        places = {name: row for row, name in enumerate(names)} | {"": _NOBODY}
-        at = np.array([places.get(name, _ANOTHER) for name in ahead], dtype=np.int64)
-        columns = Columns(np.array(ahead, dtype=object), at, values.reshape(-1, 5).T)
-        return _view(names, columns, reader.motion, look_ahead)
+        return _arranged(names, _read(reader, names, look_ahead), before)
     except Exception as error:
         # libsumo's and traci's are two classes of this name.
         if type(error).__name__ != "TraCIException":
@@ -172,33 +243,24 @@ def view_of(reader: DirectReader | SubscribedReader, names: list[str], look_ahea
         ) from error
 
 
-def _columns_of(names: list[str], read: Read) -> Columns:
-    """Returns columns of what the bridge has read."""
-    ahead = np.array([*names, "", ""], dtype=object)[read.rows]
-    ahead[read.rows == _ANOTHER] = read.others
-    return Columns(ahead, read.rows, read.values.T)
+def _read(reader: DirectReader | SubscribedReader, names: list[str], look_ahead: float) -> Read:
+    """Reads vehicles and who is ahead of them, as `bridge.cpp` does.
 
-
-def _view(
-    names: list[str],
-    columns: Columns,
-    motion: Callable[[str], Sequence[float]],
-    look_ahead: float,
-) -> View:
-    """Returns vehicles and their leaders, those with a leader first.
-
-    `motion` answers speed and acceleration of a leader who is not among the vehicles.
     SUMO's own gap leaves `minGap` out. At some junctions TraCI answers a leader at -1.8e308 m,
     which is none.
     """
-    ahead, rows = columns.ahead, columns.rows
-    raw, speed, acceleration, min_gap, allowed = columns.values
+    rows = [reader.row(name) for name in names]
+    ahead = [leader[0] if leader else "" for leader, *_ in rows]
+    values = np.array([(leader[1] if leader else np.inf, *row) for leader, *row in rows])
+    raw, speed, acceleration, min_gap, allowed = values.reshape(-1, 5).T
+    places = {name: row for row, name in enumerate(names)} | {"": _NOBODY}
+    at = np.array([places.get(name, _ANOTHER) for name in ahead], dtype=np.int64)
     gap = raw + min_gap
-    follows = (rows != _NOBODY) & (np.abs(raw) <= FREE_ROAD_M) & (gap <= look_ahead)
-    leader_speed = np.where(follows, speed.take(rows, mode="clip"), speed)
-    leader_acceleration = np.where(follows, acceleration.take(rows, mode="clip"), 0.0)
-    for row in (follows & (rows < 0)).nonzero()[0].tolist():
-        leader_speed[row], leader_acceleration[row] = motion(ahead[row])
+    follows = (at != _NOBODY) & (np.abs(raw) <= FREE_ROAD_M) & (gap <= look_ahead)
+    leader_speed = np.where(follows, speed.take(at, mode="clip"), speed)
+    leader_acceleration = np.where(follows, acceleration.take(at, mode="clip"), 0.0)
+    for row in (follows & (at == _ANOTHER)).nonzero()[0].tolist():
+        leader_speed[row], leader_acceleration[row] = reader.motion(ahead[row])
     signals = [
         speed,
         acceleration,
@@ -208,21 +270,20 @@ def _view(
         allowed,
         np.where(follows, min_gap, 0.0),
     ]
-    order = np.argsort(~follows, kind="stable")
-    seen = Seen(*torch.from_numpy(np.stack(signals)[:, order]).unbind())
-    count = int(follows.sum())
-    placed = np.array(names, dtype=object)[order].tolist()
-    place = np.empty_like(order)
-    place[order] = np.arange(len(order))
-    among = np.where(follows & (rows >= 0), place.take(rows, mode="clip"), _ANOTHER)[order]
-    return View(
-        placed[:count],
-        ahead[order[:count]].tolist(),
-        placed[count:],
-        seen,
-        torch.from_numpy(among),
-        torch.from_numpy(order),
-    )
+    others = [name for name in ahead if name not in places]
+    return Read(at, others, follows, np.stack(signals))
+
+
+def _arranged(names: list[str], read: Read, before: View | None) -> View:
+    """Returns vehicles and their leaders, those with a leader first."""
+    if before is not None and before.arrangement.is_still(names, read):
+        arrangement = before.arrangement
+    else:
+        arrangement = Arrangement.of(names, read)
+    signals = read.signals
+    if arrangement.alone:
+        signals = signals[:, arrangement.order.numpy()]
+    return View(arrangement, Seen(*torch.from_numpy(signals).unbind()))
 
 
 def _culprit(reader: DirectReader | SubscribedReader, names: list[str]) -> str:

@@ -1,7 +1,8 @@
 """What a live driver knows of vehicles: one table of tensors, and whose row is which.
 
 Shapes: C vehicles, L frames of a token, n tuned parameters, m width of the model's memory, s width
-of the networks' state, k driver features, q numbers that a stochastic head keeps.
+of the networks' state, c features of conditioning, k driver features, q numbers that a stochastic
+head keeps.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass, fields
 import torch
 from torch import Tensor
 
-from cfx.plugin import OBSERVED, Agent, DrivingModel
+from cfx.plugin import OBSERVED, Agent, DriverRows, DrivingModel
 
 
 @dataclass(frozen=True)
@@ -27,12 +28,15 @@ class VehicleTable:
         latent: `(C, q)`, what a stochastic head keeps of its random numbers.
         network: `(C,)` int64, which of the agent's networks drives.
         base: `(C, n)`, SI units, the base parameters; NaN where the agent needs none.
+        unit_base: `(C, n)`, the base in unit space, as a head needs it; `(C, 0)` where it needs
+            none.
+        conditioning: `(C, c)`, what networks read of each vehicle in every window.
         driver_features: `(C, k)`; NaN for unseen drivers.
         steps: `(C,)` int64, of the model since the vehicle's first window.
         time: `(C,)` s, of the last frame; NaN before the first.
         driven: `(C,)` bool; the others are watched.
         score: `(C,)`, how far outside what was learned each was when its window began.
-        beyond: `(C, 2 f)` bool, which signals alone were unusual then.
+        beyond: `(C, 2 f)`, 1 for the signals that alone were unusual then.
         free: `(C,)` bool; these drive without a leader.
         start: `(C,)` m/s, speed at the last frame.
         ramp: `(C,)` m/s2, acceleration until the next frame.
@@ -47,6 +51,8 @@ class VehicleTable:
     latent: Tensor
     network: Tensor
     base: Tensor
+    unit_base: Tensor
+    conditioning: Tensor
     driver_features: Tensor
     steps: Tensor
     time: Tensor
@@ -71,15 +77,17 @@ class VehicleTable:
             parameters=_unknown(count, parameters),
             memory=torch.zeros((count, model.memory_size), dtype=torch.float64),
             state=state.new_zeros((count, state.shape[-1])),
-            latent=begun.latent.new_zeros((count, begun.latent.shape[-1])),
+            latent=torch.zeros((count, begun.latent.shape[-1]), dtype=torch.float64),
             network=torch.zeros(count, dtype=torch.int64),
             base=_unknown(count, parameters),
+            unit_base=_unknown(count, parameters if agent.core.head.needs_base else 0),
+            conditioning=_unknown(count, begun.conditioning.shape[-1]),
             driver_features=_unknown(count, features),
             steps=torch.zeros(count, dtype=torch.int64),
             time=_unknown(count),
             driven=torch.zeros(count, dtype=torch.bool),
             score=torch.zeros(count, dtype=torch.float64),
-            beyond=torch.zeros((count, begun.beyond.shape[-1]), dtype=torch.bool),
+            beyond=torch.zeros((count, begun.beyond.shape[-1]), dtype=torch.float64),
             free=torch.zeros(count, dtype=torch.bool),
             start=_unknown(count),
             ramp=_unknown(count),
@@ -100,6 +108,21 @@ class VehicleTable:
         """
         for column in fields(self):
             getattr(self, column.name)[rows] = columns[column.name]
+
+    @property
+    def drivers(self) -> DriverRows:
+        """The columns that an agent reads and writes."""
+        return DriverRows(
+            history=self.history,
+            network=self.network,
+            base=self.unit_base,
+            conditioning=self.conditioning,
+            state=self.state,
+            latent=self.latent,
+            parameters=self.parameters,
+            score=self.score,
+            beyond=self.beyond,
+        )
 
     def with_rows(self, more: VehicleTable) -> VehicleTable:
         """Returns these rows and then the others."""
@@ -167,12 +190,16 @@ class KnownVehicles:
         """Says whether `rows_again` was given these vehicles last, and none of them has gone."""
         return names == self._last
 
-    def rows_again(self, names: list[str]) -> Tensor:
-        """Does what `add` does; mostly for the same vehicles, where nothing is looked up."""
+    def rows_again(self, names: list[str]) -> tuple[list[str], Tensor]:
+        """Does what `add` does; mostly for the same vehicles, where nothing is looked up.
+
+        Returns:
+            The names and the rows: the same objects as last for the same vehicles.
+        """
         if names != self._last:
             self._last_rows = self.add(names)
-            self._last = list(names)
-        return self._last_rows
+            self._last = names
+        return self._last, self._last_rows
 
     def drop(self, name: str) -> None:
         """Drops a vehicle, if it is known."""

@@ -5,18 +5,19 @@ Shapes: D vehicles, n tuned parameters, L frames of a token.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from cfx.plugin import OBSERVED, Agent, AgentState, DriverContext, History
+from cfx.plugin import Agent, DriverContext, RowChoice
 from cfx_sumo.live.assignments import Assignments
 from cfx_sumo.live.clock import Clock
 from cfx_sumo.live.draws import standard_normal
 from cfx_sumo.live.vehicles import KnownVehicles
 
-_BLOCK = 1024
+_BLOCK = 256
 """Vehicles for which the networks answer at once: what more of them need exceeds the processor's
-caches, and takes twice as long for each."""
+caches, and takes longer for each."""
 
 
 class PolicyWindows:
@@ -36,6 +37,7 @@ class PolicyWindows:
         self._vehicles = vehicles
         self._assignments = assignments
         self._seed = seed if policy.core.head.is_stochastic else None
+        self._choice = RowChoice(policy)
 
     def begin(self, rows: Tensor, names: list[str]) -> None:
         """Begins vehicles behind a leader anew, with what is known of them from elsewhere.
@@ -48,9 +50,7 @@ class PolicyWindows:
             DataError: no network drives one of them.
         """
         self._begin(rows, names)
-        table, begun = self._vehicles.table, self._begun(rows)
-        table.state[rows] = begun.state[begun.network, begun.place]
-        table.latent[rows] = begun.latent
+        self._begin_networks(rows)
 
     def begin_free(self, rows: Tensor, names: list[str]) -> None:
         """Begins vehicles without a leader anew: the policy has never seen a free road.
@@ -71,13 +71,16 @@ class PolicyWindows:
 
     def renew(self, row: int) -> None:
         """Lets the memory of a vehicle begin anew; the frames of its last window stay."""
-        begun = self._begun(torch.tensor([row]))
-        self._vehicles.table.state[row] = begun.state[begun.network, begun.place][0]
+        table, rows = self._vehicles.table, torch.tensor([row])
+        latent = table.latent[rows]
+        self._begin_networks(rows)
+        table.latent[rows] = latent
 
     def are_due(self, rows: Tensor, clock: Clock) -> Tensor:
         """Says whose window begins, bool `(D,)`."""
         stride = clock.steps_in(self._policy.windows.stride * self._policy.dt)
-        return self._vehicles.table.steps[rows] % stride == 0
+        steps = self._vehicles.table.steps.numpy()[rows.numpy()]
+        return torch.from_numpy(steps % stride == 0)
 
     def choose(self, rows: Tensor, names: list[str], now: float, clock: Clock) -> None:
         """Chooses the parameters of those vehicles whose window begins.
@@ -88,22 +91,22 @@ class PolicyWindows:
             now: at which the model's step begins, s.
             clock: of the simulation.
         """
-        due = self.are_due(rows, clock).nonzero().flatten()
-        for block in due.tensor_split(max(1, -(-len(due) // _BLOCK))):
+        due = torch.from_numpy(np.flatnonzero(self.are_due(rows, clock).numpy()))
+        if len(due) == 0:
+            return
+        for block in due.tensor_split(-(-len(due) // _BLOCK)):
             noise = None
             if self._seed is not None:
                 drawn = [names[number] for number in block.tolist()]
                 noise = standard_normal(self._seed, drawn, now, self._policy.core.head.noise_width)
-            self._choose_together(rows[block], noise)
+            self._choice.act(self._vehicles.table.drivers, rows[block], noise)
 
     def observe(self, rows: Tensor, clock: Clock) -> None:
         """Lets the policy see the windows that begin of vehicles that somebody else drives."""
         rows = rows[self.are_due(rows, clock)]
         if len(rows) == 0:
             return
-        history, state = self._now(rows)
-        after = self._policy.observe(history, state, torch.ones(len(rows), dtype=torch.bool))
-        self._vehicles.table.state[rows] = after.state[after.network, after.place]
+        self._choice.observe(self._vehicles.table.drivers, rows)
 
     def _begin(self, rows: Tensor, names: list[str]) -> None:
         table = self._vehicles.table
@@ -112,37 +115,13 @@ class PolicyWindows:
         table.told[rows] = torch.nan
         self._assignments.begin(table, rows, names)
 
-    def _choose_together(self, rows: Tensor, noise: Tensor | None) -> None:
-        """Lets the networks answer for vehicles at once."""
-        if len(rows) == 0:
-            return
-        table = self._vehicles.table
-        history, state = self._now(rows)
-        chosen, after = self._policy.act(history, state, noise=noise)
-        table.parameters[rows] = chosen
-        table.score[rows], table.beyond[rows] = after.score, after.beyond
-        table.latent[rows] = after.latent
-        table.state[rows] = after.state[after.network, after.place]
-
     def _base(self, rows: Tensor) -> Tensor | None:
         if self._policy.base is None:
             return None
         return self._vehicles.table.base[rows]
 
-    def _begun(self, rows: Tensor) -> AgentState:
-        """Returns the state of vehicles before their first window."""
+    def _begin_networks(self, rows: Tensor) -> None:
+        """Puts the state of the networks before their first window into the rows of vehicles."""
         table = self._vehicles.table
         context = DriverContext(self._base(rows), table.driver_features[rows])
-        return self._policy.begin(table.network[rows], context)
-
-    def _now(self, rows: Tensor) -> tuple[History, AgentState]:
-        """Returns the last frames of vehicles, and where the policy stands with them."""
-        table = self._vehicles.table
-        begun, last = self._begun(rows), table.state[rows]
-        if len(self._policy.names) == 1:
-            state = last[None]
-        else:
-            state = begun.state.clone()
-            state[begun.network, begun.place] = last
-        now = begun._replace(state=state, latent=table.latent[rows])
-        return dict(zip(OBSERVED, table.history[rows].unbind(1), strict=True)), now
+        self._choice.begin(table.drivers, rows, context)
