@@ -319,24 +319,26 @@ class Posterior:
     def with_slope(self, place: Tensor) -> tuple[Tensor, Tensor]:
         """Returns the log density whatever the noise's scale, `(P, q)`, and its slope.
 
-        Slopes of what is simulated are differences: any model has them.
+        Slopes are differences: any model has them, and autograd would take as long for the noise's
+        few coordinates as the kernel takes to simulate all candidates.
 
         Args:
             place: coordinates but for the last, `(P, q, d - 1)`.
         """
-        s = self.simulated
-        shift = DIFFERENCE * torch.eye(s, dtype=place.dtype)
-        moved = place[..., None, :s] + torch.cat([torch.zeros_like(shift[:1]), shift])
-        asked = moved.flatten(1, 2)
-        products = self.products(asked)
-        products = products.view(*moved.shape[:3], *products.shape[-2:])
-        with torch.enable_grad():
-            own = place[..., None, s:].detach().requires_grad_()
-            density = noise.marginal_log_density(products, self.count[..., None], own)
-            (of_noise,) = torch.autograd.grad(density[..., 0].sum(), own)
-        density = density.detach() + self.prior_log_density(asked).view_as(density)
-        of_simulated = (density[..., 1:] - density[..., :1]) / DIFFERENCE
-        return density[..., 0], torch.cat([of_simulated, of_noise[..., 0, :]], dim=-1)
+        s, e = self.simulated, place.shape[-1]
+        # One candidate where it is, and one beside it in each coordinate: (P, q, 1 + e, e).
+        shift = DIFFERENCE * torch.eye(e, dtype=place.dtype)
+        moved = place[..., None, :] + torch.cat([torch.zeros_like(shift[:1]), shift])
+        # Those beside it in a coordinate of the noise have its errors, so they are not simulated.
+        simulated = moved[..., : 1 + s, :].flatten(1, 2)
+        products = self.products(simulated).unflatten(1, (-1, 1 + s))
+        own = products[:, :, :1].expand(-1, -1, e - s, -1, -1)
+        likelihood = noise.marginal_log_density(
+            torch.cat([products, own], dim=2), self.count[..., None], moved[..., s:]
+        )
+        density = likelihood + self.prior_log_density(moved.flatten(1, 2)).view_as(likelihood)
+        slope = (density[..., 1:] - density[..., :1]) / DIFFERENCE
+        return density[..., 0], slope
 
     def draw_scales(self, place: Tensor, generator: torch.Generator) -> Tensor:
         """Returns the last coordinates, `(P, q, 1)`, as likely as the others `(P, q, d - 1)`."""
