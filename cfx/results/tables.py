@@ -391,6 +391,12 @@ class KnownParameters:
                 ahead = self.evidence[name] - others[second]
                 said += f", the most evident kind; {second} comes next, {ahead:.0f} nats behind"
             sentences.append(f"{said}.")
+        if "likelihood_power" in self.rows:
+            power = float(self.rows["likelihood_power"].iloc[0])
+            sentences.append(
+                f"Each step counts {power:g} times: the model's regimes jump, and intervals would be"
+                " too narrow otherwise (likelihood_power)."
+            )
         pairs = len(self.rows)
         if "held" in self.rows and not self.checked:
             sentences.append(
@@ -490,6 +496,12 @@ class Fits(ResultTable):
             "1",
             "the driver's own share of it: 0, predicted in one closed loop, to 1, from each"
             " measured state to the next",
+            required=False,
+        ),
+        Column(
+            "likelihood_power",
+            "1",
+            "with which power the likelihood counts, where the model declares one below 1",
             required=False,
         ),
         Column("noise_scale", "m/s or m", "what each step of the noise adds", required=False),

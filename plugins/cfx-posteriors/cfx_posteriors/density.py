@@ -175,6 +175,11 @@ class Posterior:
         return "speed"
 
     @property
+    def power(self) -> float:
+        """The power of the likelihood, which the model declares."""
+        return self.segments.stepper.model.likelihood_power
+
+    @property
     def counted(self) -> Tensor:
         """1 for steps that count, `(K, P, 1)`."""
         return self.segments.segments.counted[self.stride - 1 :: self.stride, :, None]
@@ -188,15 +193,14 @@ class Posterior:
         innovations, those that remember have hardly any: the density is of all errors given the
         first. Scored too, intervals of Krauss's t_r held 82 instead of 88 %.
 
-        Models with regimes do not forget it: see `DrivingModel.likelihood_power`. Products of two
+        Models with regimes do not forget it: see `power`. Products of two
         errors, which the likelihood is made of, have the power as their weight. It is a coarsened
         posterior (J. W. Miller and D. B. Dunson 2019, *Robust Bayesian inference via coarsening*,
         Journal of the American Statistical Association 114).
         """
         scored = self.counted.clone()
         scored[0] = 0.0
-        power = self.segments.stepper.model.likelihood_power
-        return scored if power == 1.0 else scored * math.sqrt(power)
+        return scored * math.sqrt(self.power)
 
     @property
     def count(self) -> Tensor:

@@ -126,6 +126,9 @@ class ParameterIntervals(DriverPosteriors):
         for kind, values in self.diagnostics.items():
             found[kind] = values.numpy()
         found["noise"] = np.full(len(self.low), self.noise.name, dtype=object)
+        power = self.noise.posterior.power
+        if power != 1.0:
+            found["likelihood_power"] = np.full(len(self.low), power)
         for kind, values in self.fan.check(self.seed).items():
             found[kind] = values.numpy()
         return found
