@@ -86,8 +86,8 @@ class W99(DrivingModel):
     reference = "Wiedemann (1974, 1999); PTV Vissim manual, CC0 to CC9; SUMO's carFollowModel W99"
     schema: ClassVar[type[Settings]] = W99Settings
     settings: W99Settings
-    # Chosen on 60 simulated drivers of 60 s (`coverage w99`): 90 % intervals hold 89 to 92 % of their
-    # parameters, with 0.3 92 to 93 % and with 1, of 30 drivers, 76 to 87 %.
+    # Chosen on simulated drivers of 60 s: 90 % intervals hold 89 to 92 % of their parameters with
+    # 0.5, 92 to 93 % with 0.3, 76 to 87 % with 1. docs/how-to/uncertainty.md has those of others.
     likelihood_power: ClassVar[float] = 0.5
 
     parameters = ParameterSpace.of(

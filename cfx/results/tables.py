@@ -394,8 +394,8 @@ class KnownParameters:
         if "likelihood_power" in self.rows:
             power = float(self.rows["likelihood_power"].iloc[0])
             sentences.append(
-                f"Each step counts {power:g} times: the model's regimes jump, and intervals would be"
-                " too narrow otherwise (likelihood_power)."
+                f"Each step counts {power:g} times (likelihood_power): the model's regimes jump,"
+                " and intervals would be too narrow otherwise."
             )
         pairs = len(self.rows)
         if "held" in self.rows and not self.checked:
