@@ -99,6 +99,9 @@ class DrivingModel(Component):
         search_effort: how many times the usual evaluations a search for its parameters takes. Above
             1 for a model whose losses have narrow valleys or jumps, so that searches of the usual
             length end above the optimum (`python -m tests.benchmarks.optimum` says so).
+        likelihood_power: power of the likelihood in posteriors. Below 1 for a model whose regimes
+            jump: errors of the start and of each measured state decide which regime a driver is in,
+            which no noise describes, and intervals would be too narrow (`calibration.posterior`).
         needs_simulator: name of the simulator that alone can drive the model; "" for a model with
             equations in Python, which every simulator that uses them can drive. Where it is given,
             `next_speed` raises a ConfigError.
@@ -117,6 +120,7 @@ class DrivingModel(Component):
     collision_free: ClassVar[bool] = False
     has_constant_baseline: ClassVar[bool] = True
     search_effort: ClassVar[float] = 1.0
+    likelihood_power: ClassVar[float] = 1.0
     needs_simulator: ClassVar[str] = ""
     reference: ClassVar[str] = ""
     temperature: Temperature = 0.0

@@ -390,6 +390,12 @@ class KnownParameters:
                 ahead = self.evidence[name] - others[second]
                 sentence += f", the most evident kind; {second} comes next, {ahead:.0f} nats behind"
             sentences.append(f"{sentence}.")
+        if "likelihood_power" in self.rows:
+            power = float(self.rows["likelihood_power"].iloc[0])
+            sentences.append(
+                f"Each step counts {power:g} times (likelihood_power): the model's regimes jump,"
+                " and intervals would be too narrow otherwise."
+            )
         pairs = len(self.rows)
         if "held" in self.rows and not self.checked:
             sentences.append(
@@ -489,6 +495,12 @@ class Fits(ResultTable):
             "1",
             "the driver's own share of it: 0, predicted in one closed loop, to 1, from each"
             " measured state to the next",
+            required=False,
+        ),
+        Column(
+            "likelihood_power",
+            "1",
+            "with which power the likelihood counts, where the model declares one below 1",
             required=False,
         ),
         Column("noise_scale", "m/s or m", "what each step of the noise adds", required=False),

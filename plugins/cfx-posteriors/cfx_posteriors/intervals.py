@@ -126,6 +126,9 @@ class ParameterIntervals(DriverPosteriors):
         for kind, values in self.diagnostics.items():
             by_name[kind] = values.numpy()
         by_name["noise"] = np.full(len(self.low), self.noise.name, dtype=object)
+        power = self.noise.posterior.power
+        if power != 1.0:
+            by_name["likelihood_power"] = np.full(len(self.low), power)
         for kind, values in self.fan.check(self.seed).items():
             by_name[kind] = values.numpy()
         return by_name

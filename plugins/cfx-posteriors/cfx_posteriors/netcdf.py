@@ -40,6 +40,7 @@ _DIAGNOSTICS = {
     "noise_scale": "what each step of the noise adds",
     "noise_correlation": "of the noise with itself one step later",
     "noise_gain": "the driver's own share of the noise, 0 to 1",
+    "likelihood_power": "power with which the likelihood counts",
     "held": "share of the held-out steps that forecasts hold; 0.9 is right",
     "held_chance": "below 0.05 forecasts miss more of the held-out part than chance allows",
 }

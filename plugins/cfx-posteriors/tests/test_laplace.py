@@ -27,6 +27,24 @@ def test_the_mode_is_higher_than_anything_near_it() -> None:
     assert float((drawn.posterior(near) - normal.log_density[:, None]).max()) < 0.05
 
 
+def test_a_model_may_have_its_likelihood_count_less(monkeypatch: pytest.MonkeyPatch) -> None:
+    posterior, truth, _ = draw_recordings(Krauss(), 4, frames=300)
+    places = truth[:, None] + torch.linspace(-0.2, 0.2, 5, dtype=torch.float64)[:, None]
+
+    def likelihood() -> torch.Tensor:
+        prior = noise.prior_log_density(places[..., 2:]) + posterior.prior_log_density(places)
+        return posterior(places) - prior
+
+    whole = likelihood()
+    monkeypatch.setattr(Krauss, "likelihood_power", 0.25)
+    torch.testing.assert_close(likelihood(), 0.25 * whole)
+    normal = laplace(posterior, truth[:, None, :2])
+    assert bool(normal.settled.all())
+    away = torch.randn((4, 32, 4), generator=torch.Generator().manual_seed(0)).double()
+    near = normal.mode[:, None] + 0.2 * away @ torch.linalg.cholesky(normal.covariance).mT
+    assert float((posterior(near) - normal.log_density[:, None]).max()) < 0.05
+
+
 def test_searches_find_the_highest_mode_however_far_it_is() -> None:
     drawn = draw_recordings(IDM(), 100, signal="gap")
     normal = laplace(drawn.posterior, likely_starts(drawn.posterior, seed=0))

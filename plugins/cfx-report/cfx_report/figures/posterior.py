@@ -65,7 +65,8 @@ def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
     canvas.legend_above(figure, [handles[words] for words, *_ in _KINDS if words in handles])
     figure.supxlabel(
         canvas.wrapped(
-            f"{wording.plural(len(rows), 'pair')}, in the order of their medians (dots)"
+            f"{wording.plural(len(rows), 'pair')}, in the order of their medians (dots); above each"
+            " panel: for how many the parameter is determined"
         ),
         fontsize=canvas.points(10.5),
         color=colours.INK,
@@ -94,7 +95,16 @@ def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
                 linewidth=size,
                 label=words,
             )
-    place.plot(number, middle, ".", color=colours.INK, markersize=2.5)
+    # White around a dot tells it from the interval that it lies on.
+    place.plot(
+        number,
+        middle,
+        "o",
+        color=colours.INK,
+        markersize=1.4 * size,
+        markeredgecolor="white",
+        markeredgewidth=0.3 * size,
+    )
     if axis.low is not None and axis.high is not None:
         for bound in (axis.low, axis.high):
             place.axhline(bound, color=colours.EDGE, linestyle="--", linewidth=1)
@@ -142,7 +152,7 @@ def draw_pairs(
     for number, axis in enumerate(axes):
         named = wording.unit_label(axis.name, axis.unit)
         grid[-1, number].set_xlabel(named, fontsize=canvas.points(9))
-        grid[number, 0].set_ylabel(named if number else "draws", fontsize=canvas.points(9))
+        grid[number, 0].set_ylabel(named if number else "density", fontsize=canvas.points(9))
     handles, _ = grid[0, 0].get_legend_handles_labels()
     canvas.legend_above(figure, handles)
     said = canvas.wrapped(
@@ -213,7 +223,10 @@ def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
         held = (low <= measured) & (measured <= high)
         place.axvline(time[after][0], color=colours.EDGE, linestyle="--", linewidth=1)
         share = held[after].mean()
-        say = f"{wording.shortened(pair_id)}: {share:.0%} of the steps after the dashed line held"
+        say = (
+            f"{wording.shortened(pair_id)}: without noise up to the dashed line; after it forecasts"
+            f" with noise, which hold {share:.0%} of the recording"
+        )
     else:
         say = wording.shortened(pair_id)
     place.set_xlabel("time from the start of the pair (s)")
@@ -295,8 +308,10 @@ class PosteriorFan(JobFigure):
     title = "Trajectories of one driver's posterior"
     caption = (
         f"The middle {INTERVAL_LEVEL:.0%} of the trajectories of the same driver's posterior, and"
-        " what was recorded. Up to the dashed line they are simulated, on the part that was"
-        " calibrated on. After it they are forecasts, with noise that goes on from the last error."
+        " what was recorded. Up to the dashed line, on the part that was calibrated on, they are"
+        " predictions without noise: one closed loop or, where noise is of the driver's"
+        " acceleration, from measured state to measured state. So the recording may lie outside."
+        " After it they are forecasts, with noise that goes on from the last error."
     )
     order = 135
 
