@@ -1,12 +1,13 @@
 """Several rivals in one: their forecasts are mixed with weights for each horizon.
 
 Which rival says best what happens depends on how far ahead: regressions in the first seconds, what
-drives in closed loop after them. A share of the training drivers is kept from the members; on these
-drivers the weights of each horizon are found, and what the mix leaves unexplained there makes its
-forecasts distributions. Then the members learn from everybody.
+drives in closed loop after them. The training sites are divided in two halves, and members learn
+from one half what they forecast of the other: on a road that is new to them, as in the test. There
+the weights of each horizon are found, and what the mix leaves unexplained makes its forecasts
+distributions. Then the members learn from everybody.
 
-Differences from the papers: Breiman's folds are one share of drivers here, since members may take
-minutes to learn; the errors that dress a forecast are those of similar moments, as in analog
+Differences from the papers: Breiman's folds are two halves of the sites here, since members may
+take minutes to learn; the errors that dress a forecast are those of similar moments, as in analog
 ensembles (Delle Monache et al. 2013, Monthly Weather Review 141), not of all.
 
 Shapes: Q moments, M members, H horizons, S samples. SI units.
@@ -45,7 +46,7 @@ class StackedSettings(Settings):
         description="rivals that are mixed, with their default settings",
     )
     similar: int = Field(
-        200, ge=2, description="moments of drivers who were kept, whose errors dress a forecast"
+        200, ge=2, description="moments of the other half, whose errors dress a forecast"
     )
 
 
@@ -58,7 +59,7 @@ class Stacked(Rival):
     settings: StackedSettings
 
     def fit(self, pairs: PairSet, seed: int) -> Driver:
-        """Learns weights from drivers who are kept, and then each member from all.
+        """Learns weights from one half of the sites and the other, and then each member from all.
 
         Raises:
             ConfigError: a member is `stacked` itself, or no rival.
@@ -68,21 +69,72 @@ class Stacked(Rival):
         members = []
         for name in self.settings.members:
             members.append(cast(Rival, registry.create("rival", {"name": name})))
-        learned, kept = divided(pairs, seed)
-        mixing = Mixing.found(
-            [member.fit(learned, seed) for member in members], kept, self.settings.similar
-        )
+        told = []
+        for learned, other in halves(pairs, seed):
+            drivers = [member.fit(learned, seed) for member in members]
+            told.append(Forecasts.of(drivers, other))
+        mixing = Mixing.found(Forecasts.joined(told), self.settings.similar)
         return StackedDriver([member.fit(pairs, seed) for member in members], mixing)
 
 
+class Forecasts(NamedTuple):
+    """What members that never saw the drivers say of Q moments of theirs.
+
+    Attributes:
+        now: speeds at the moments, `(Q, 1)`, m/s.
+        predicted: by each member at each horizon, `(M, Q, H)`, m/s.
+        measured: `(Q, H)`, m/s.
+        evenness: of each moment at each horizon, as `_evenness` returns it, `(Q, H)`.
+        situations: what tells moments apart, `(Q, f)`.
+        driving: RMSE of speed of each member over full trajectories, `(M,)`, m/s.
+    """
+
+    now: Floats
+    predicted: Floats
+    measured: Floats
+    evenness: Floats
+    situations: Floats
+    driving: Floats
+
+    @classmethod
+    def of(cls, drivers: list[Driver], pairs: PairSet) -> Forecasts:
+        """Lets members forecast, and drive, drivers whom they have not learned from."""
+        driving = np.array([mean_error(driver, pairs) for driver in drivers])
+        asked = moments(list(pairs), _PAST_S, _EVERY_S, HORIZONS_S[-1])
+        if not len(asked):
+            raise ConfigError(
+                f"rival=stacked: no pair of a half of the sites lasts {_PAST_S + HORIZONS_S[-1]:g}"
+                " s; give longer recordings"
+            )
+        batch = asked.batch()
+        now = _at(batch.follower_speed, asked.first, batch.dt, (0.0,))
+        measured = _at(batch.follower_speed, asked.first, batch.dt, HORIZONS_S)
+        predicted = _predicted(drivers, asked.blanked(), asked.first)
+        even = _evenness(asked, measured - now)
+        situations = _situation(batch, asked.first)
+        return cls(now, predicted, measured, even, situations, driving)
+
+    @classmethod
+    def joined(cls, parts: list[Forecasts]) -> Forecasts:
+        """Returns the moments of several parts as one; each part's driving counts alike."""
+        return cls(
+            np.concatenate([part.now for part in parts]),
+            np.concatenate([part.predicted for part in parts], axis=1),
+            np.concatenate([part.measured for part in parts]),
+            np.concatenate([part.evenness for part in parts]),
+            np.concatenate([part.situations for part in parts]),
+            np.mean([part.driving for part in parts], axis=0),
+        )
+
+
 class Mixing(NamedTuple):
-    """What drivers who were kept say of the members.
+    """How members are mixed.
 
     Attributes:
         weights: of each member at each horizon, `(H, M)`, none below zero.
-        drives: number of the member that drives them best.
-        similar: finds moments of theirs by what `_situation` returns, which it scales.
-        scale: of situations.
+        drives: number of the member that drives best.
+        similar: finds moments by what `_situation` returns, divided by `scale`.
+        scale: of situations, `(f,)`.
         errors: measured less mixed speeds at these moments, `(Q, H)`, m/s.
     """
 
@@ -93,38 +145,20 @@ class Mixing(NamedTuple):
     errors: Floats
 
     @classmethod
-    def found(cls, drivers: list[Driver], kept: PairSet, similar: int) -> Mixing:
-        """Finds it from what members that never saw these drivers say of them."""
-        driving_errors = [mean_error(driver, kept) for driver in drivers]
-        asked = moments(list(kept), _PAST_S, _EVERY_S, HORIZONS_S[-1])
-        if not len(asked):
-            raise ConfigError(
-                f"rival=stacked: no driver who was kept lasts {_PAST_S + HORIZONS_S[-1]:g} s;"
-                " give longer recordings"
-            )
-        batch, blank = asked.batch(), asked.blanked()
-        now = _at(batch.follower_speed, asked.first, batch.dt, (0.0,))
-        measured = _at(batch.follower_speed, asked.first, batch.dt, HORIZONS_S)
-        predicted = _predicted(drivers, blank, asked.first)
-        even = _evenness(asked, measured - now)
+    def found(cls, told: Forecasts, similar: int) -> Mixing:
+        """Finds the weights of least squares, none below zero, for each horizon."""
         weights = []
         for horizon in range(len(HORIZONS_S)):
-            changes = predicted[:, :, horizon].T - now
-            root = even[:, horizon]
-            solved, _ = nnls(changes * root[:, None], (measured - now)[:, horizon] * root)
-            weights.append(solved)
-        mixed = _mixed(np.array(weights), predicted, now)
-        situations = _situation(batch, asked.first)
-        scale = situations.std(0) + 1e-9
-        count = min(similar, len(asked))
-        neighbours = NearestNeighbors(n_neighbors=count).fit(situations / scale)
-        return cls(
-            np.array(weights),
-            int(np.argmin(driving_errors)),
-            neighbours,
-            scale,
-            measured - mixed,
-        )
+            root = told.evenness[:, horizon]
+            predicted = (told.predicted[:, :, horizon].T - told.now) * root[:, None]
+            measured = (told.measured[:, horizon] - told.now[:, 0]) * root
+            weights.append(nnls(predicted, measured)[0])
+        mixed = _mixed(np.array(weights), told.predicted, told.now)
+        scale = told.situations.std(0) + 1e-9
+        count = min(similar, len(mixed))
+        neighbours = NearestNeighbors(n_neighbors=count).fit(told.situations / scale)
+        drives = int(np.argmin(told.driving))
+        return cls(np.array(weights), drives, neighbours, scale, told.measured - mixed)
 
 
 class StackedDriver(Driver):
@@ -212,3 +246,20 @@ def _situation(batch: PairBatch, first: Tensor) -> Floats:
     time_gap = _at(batch.gap, first, dt, (0.0,)).clip(0.0, 100.0) / (speed + 1.0)
     now = leader[:, :1]
     return np.hstack([speed, now - speed, time_gap, leader[:, 1:] - now])
+
+
+def halves(pairs: PairSet, seed: int) -> list[tuple[PairSet, PairSet]]:
+    """Returns twice what is learned from and what is forecast: one half of the sites and the other.
+
+    The sites with most pairs come into different halves. Of a single site some drivers are kept
+    instead.
+    """
+    sites = np.array([pair.site for pair in pairs])
+    names, counts = np.unique(sites, return_counts=True)
+    if len(names) == 1:
+        return [divided(pairs, seed)]
+    largest_first = names[np.argsort(-counts, kind="stable")]
+    is_first = np.isin(sites, largest_first[::2])
+    first = pairs.take(np.flatnonzero(is_first).tolist())
+    second = pairs.take(np.flatnonzero(np.logical_not(is_first)).tolist())
+    return [(first, second), (second, first)]
