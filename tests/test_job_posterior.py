@@ -45,6 +45,18 @@ def test_intervals_that_are_not_to_be_relied_on_are_named() -> None:
     assert said[1].startswith("The intervals of 1 of 2 pairs rest on fewer than 100 independent")
 
 
+def test_a_likelihood_that_counts_less_is_said() -> None:
+    fits = {"pair_id": ["a"], "method": "driver_specific", "noise_scale": 0.1, "noise_left": 0.0}
+    rows = pd.DataFrame({**fits, "pareto_k": [0.3], "effective_samples": [600.0]})
+
+    def said(rows: pd.DataFrame) -> list[str]:
+        return [str(one) for one in KnownParameters(rows, ()).printed() if isinstance(one, Text)]
+
+    assert said(rows) == []
+    (sentence,) = said(rows.assign(likelihood_power=0.5))
+    assert sentence.startswith("Each step counts 0.5 times (likelihood_power):")
+
+
 CERTAIN = """
 import numpy as np
 from cfx.calibration.posterior import DriverPosteriors, PosteriorMethod

@@ -341,7 +341,8 @@ class Posterior:
         moved = place[..., None, :] + torch.cat([torch.zeros_like(shift[:1]), shift])
         # Those beside it in a coordinate of the noise have its errors, so they are not simulated.
         simulated = moved[..., : 1 + s, :].flatten(1, 2)
-        products = self.products(simulated).unflatten(1, (-1, 1 + s))
+        products = self.products(simulated)
+        products = products.view(*place.shape[:2], 1 + s, *products.shape[-2:])
         unmoved = products[:, :, :1].expand(-1, -1, e - s, -1, -1)
         likelihood = noise.marginal_log_density(
             torch.cat([products, unmoved], dim=2), self.count[..., None], moved[..., s:]

@@ -63,6 +63,18 @@ def test_intervals_stand_beside_the_same_point_estimates(
     assert "noise_scale" not in pd.read_parquet("plain/fits.parquet")
 
 
+def test_the_power_of_a_likelihood_stands_beside_intervals(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    pairs = cfx.read(dataset="synthetic", pairs=2, frames=200, variation=0.0)
+    whole = cfx.calibrate(pairs, "krauss", posterior="laplace").intervals
+    monkeypatch.setattr(Krauss, "likelihood_power", 0.25)
+    quarter = cfx.calibrate(pairs, "krauss", posterior="laplace").intervals
+    assert "likelihood_power" not in whole
+    assert quarter["likelihood_power"].tolist() == [0.25, 0.25]
+    assert (quarter["contraction_t_r"] < whole["contraction_t_r"]).all()
+
+
 def test_a_population_as_the_prior_leaves_less_doubt() -> None:
     doubt = {}
     for kind in ("laplace", "hierarchical"):
