@@ -430,7 +430,7 @@ def scores() -> list[str]:
             score, low, high = [100 * of_task[key] for key in ("score", "low", "high")]
             cells.append(f"{score:+.0f} % ({low:+.0f} to {high:+.0f})")
         cells.append(f"{100 * line['flow_error']:.0f} %")
-        cells.append(f"{line['train_s'] / 60:.1f}, {line['drive_s'] / 60:.1f}")
+        cells.append(f"{(line['train_s'] + line['drive_s']) / 60:.1f}")
         rows.append(cells)
     head = ("row", *[f"`{task}`" for task in tasks], "flow wrong by", "CPU minutes")
     return table(head, rows)

@@ -46,7 +46,7 @@ def test_chains_are_a_dimension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     found = cfx.run([*quick, *job, "calibration.posterior=nuts"])
     NetcdfExport().write(str(found.folder), None)
     tree = xr.open_datatree(tmp_path / "job" / "posterior.nc", engine="h5netcdf")
-    assert tree["posterior"].sizes == {"chain": 4, "draw": 50, "pair": 4}
+    assert tree["posterior"].sizes == {"chain": nuts.CHAINS, "draw": 50, "pair": 4}
     draws = pd.read_parquet(tmp_path / "job" / "posterior.parquet")
     fits = pd.read_parquet(tmp_path / "job" / "fits.parquet").query("method == 'driver_specific'")
     for pair_id, rows in draws.groupby("pair_id"):
