@@ -140,7 +140,7 @@ class EagerRows:
         self._function = function
 
     def __call__(self, count: int, inputs: Sequence[Rows], outputs: Sequence[Rows]) -> None:
-        results = self._function(*(given.values(count) for given in inputs))
+        results = self._function(*(argument.values(count) for argument in inputs))
         for (table, rows), result in zip(outputs, results, strict=True):
             where = slice(count) if rows is None else rows
             table[where] = result.reshape(count, *table.shape[1:])

@@ -150,9 +150,7 @@ class LaggedDriver(StepDriver):
             known = _future_of_each(leader, rows, first.numpy(), horizon, batch.dt)
             change = np.asarray(model.predict(np.hstack([states, known])))
             knots.append(np.maximum(speed + change, 0.0))
-        frames = torch.arange(batch.mask.shape[1])
-        time = (frames - first[:, None]).clamp(min=0).numpy() * batch.dt
-        return torch.as_tensor(between(np.stack(knots, 1), (0.0, *HORIZONS_S), time))[None]
+        return torch.as_tensor(between_horizons(np.stack(knots, 1), batch, first))[None]
 
 
 class RidgeRival(LaggedRival):
@@ -328,8 +326,17 @@ def _future_of_each(
     return np.stack(columns, 1)
 
 
-def between(knots: Floats, times: Sequence[float], at: Floats) -> Floats:
-    """Interpolates `(P, K)` values at K times linearly, at times `(P, T)`."""
+def between_horizons(knots: Floats, batch: PairBatch, first: Tensor) -> Floats:
+    """Interpolates speeds linearly at all frames of their pairs, `(P, T)`.
+
+    Args:
+        knots: speeds now and at each of `HORIZONS_S`, `(P, 1 + H)`, m/s.
+        batch: the P pairs.
+        first: the frame that is now, `(P,)`.
+    """
+    times = (0.0, *HORIZONS_S)
+    frames = torch.arange(batch.mask.shape[1])
+    at = (frames - first[:, None]).clamp(min=0).numpy() * batch.dt
     place = np.clip(np.searchsorted(times, at, side="right"), 1, len(times) - 1)
     grid = np.asarray(times)
     share = np.clip((at - grid[place - 1]) / (grid[place] - grid[place - 1]), 0.0, 1.0)

@@ -29,7 +29,7 @@ from cfx.errors import ConfigError
 from cfx.plugin import PairBatch, PairSet, Settings, registry
 from cfx_report.benchmark.rival import Driver, Rival
 from cfx_report.benchmark.segments import Segments, moments
-from cfx_rivals.lagged import HORIZONS_S, between, divided, mean_error
+from cfx_rivals.lagged import HORIZONS_S, between_horizons, divided, mean_error
 
 Floats = NDArray[np.float64]
 
@@ -69,11 +69,11 @@ class Stacked(Rival):
         members = []
         for name in self.settings.members:
             members.append(cast(Rival, registry.create("rival", {"name": name})))
-        told = []
+        forecasts = []
         for learned, other in halves(pairs, seed):
             drivers = [member.fit(learned, seed) for member in members]
-            told.append(Forecasts.of(drivers, other))
-        mixing = Mixing.found(Forecasts.joined(told), self.settings.similar)
+            forecasts.append(Forecasts.of(drivers, other))
+        mixing = Mixing.fitted(Forecasts.joined(forecasts), self.settings.similar)
         return StackedDriver([member.fit(pairs, seed) for member in members], mixing)
 
 
@@ -98,7 +98,11 @@ class Forecasts(NamedTuple):
 
     @classmethod
     def of(cls, drivers: list[Driver], pairs: PairSet) -> Forecasts:
-        """Lets members forecast, and drive, drivers whom they have not learned from."""
+        """Lets members forecast, and drive, drivers whom they have not learned from.
+
+        Raises:
+            ConfigError: no pair lasts as long as a past and the longest horizon.
+        """
         driving = np.array([mean_error(driver, pairs) for driver in drivers])
         asked = moments(list(pairs), _PAST_S, _EVERY_S, HORIZONS_S[-1])
         if not len(asked):
@@ -145,20 +149,21 @@ class Mixing(NamedTuple):
     errors: Floats
 
     @classmethod
-    def found(cls, told: Forecasts, similar: int) -> Mixing:
+    def fitted(cls, forecasts: Forecasts, similar: int) -> Mixing:
         """Finds the weights of least squares, none below zero, for each horizon."""
         weights = []
         for horizon in range(len(HORIZONS_S)):
-            root = told.evenness[:, horizon]
-            predicted = (told.predicted[:, :, horizon].T - told.now) * root[:, None]
-            measured = (told.measured[:, horizon] - told.now[:, 0]) * root
+            root = forecasts.evenness[:, horizon]
+            predicted = (forecasts.predicted[:, :, horizon].T - forecasts.now) * root[:, None]
+            measured = (forecasts.measured[:, horizon] - forecasts.now[:, 0]) * root
             weights.append(nnls(predicted, measured)[0])
-        mixed = _mixed(np.array(weights), told.predicted, told.now)
-        scale = told.situations.std(0) + 1e-9
+        mixed = _mixed(np.array(weights), forecasts.predicted, forecasts.now)
+        # What never differs, such as a leader who does not change speed, is not divided by zero.
+        scale = forecasts.situations.std(0) + 1e-9
         count = min(similar, len(mixed))
-        neighbours = NearestNeighbors(n_neighbors=count).fit(told.situations / scale)
-        drives = int(np.argmin(told.driving))
-        return cls(np.array(weights), drives, neighbours, scale, told.measured - mixed)
+        neighbours = NearestNeighbors(n_neighbors=count).fit(forecasts.situations / scale)
+        drives = int(np.argmin(forecasts.driving))
+        return cls(np.array(weights), drives, neighbours, scale, forecasts.measured - mixed)
 
 
 class StackedDriver(Driver):
@@ -179,7 +184,7 @@ class StackedDriver(Driver):
         return driver.drive(batch, first, seed if driver.is_stochastic else None)
 
     def adapted(self, past: PairSet, seed: int) -> Driver:
-        return StackedDriver([one.adapted(past, seed) for one in self.members], self.mixing)
+        return StackedDriver([member.adapted(past, seed) for member in self.members], self.mixing)
 
     def forecast(self, batch: PairBatch, first: Tensor, seed: int, samples: int) -> Tensor:
         """Returns the mixed forecast with errors of similar moments, `(S, P, T)`."""
@@ -190,12 +195,10 @@ class StackedDriver(Driver):
         random = np.random.default_rng(seed)
         drawn = random.permuted(nearest, axis=1)[:, np.arange(samples) % nearest.shape[1]]
         knots = np.maximum(mixed[:, None] + self.mixing.errors[drawn], 0.0)
-        frames = torch.arange(batch.mask.shape[1])
-        time = (frames - first[:, None]).clamp(min=0).numpy() * batch.dt
         paths = []
         for sample in range(samples):
             path = np.concatenate([now, knots[:, sample]], 1)
-            paths.append(between(path, (0.0, *HORIZONS_S), time))
+            paths.append(between_horizons(path, batch, first))
         return torch.as_tensor(np.stack(paths))
 
 
