@@ -413,12 +413,19 @@ def standing(task: str) -> dict[str, Any]:
     return tasks[task]
 
 
+DRIVEN = ("new_road", "same_road", "known")
+"""Tasks of `roads` in which trajectories are driven."""
+
+
+def lines_by_row(task: str) -> dict[str, dict[str, Any]]:
+    """Returns what a task says of each row of `roads`, by the row's name, the best first."""
+    return {line["row"]: line for line in standing(task)["rows"]}
+
+
 def scores() -> list[str]:
     """Returns the scores of the rows of `roads` in each task, the best on new roads first."""
-    tasks = ("new_road", "same_road", "known", "forecast")
-    by_task = {}
-    for task in tasks:
-        by_task[task] = {line["row"]: line for line in standing(task)["rows"]}
+    tasks = (*DRIVEN, "forecast")
+    by_task = {task: lines_by_row(task) for task in tasks}
     rows = []
     for name, line in by_task["new_road"].items():
         cells = [name]
@@ -438,15 +445,14 @@ def scores() -> list[str]:
 
 def driving() -> list[str]:
     """Returns errors, over sites, and collisions of the rows of `roads`."""
-    tasks = ("new_road", "same_road", "known")
     head, by_task = ["row"], {}
-    for task in tasks:
-        by_task[task] = {line["row"]: line for line in standing(task)["rows"]}
+    for task in DRIVEN:
+        by_task[task] = lines_by_row(task)
         head += [f"`{task}`: speed", "gap", "collisions"]
     rows = []
     for name in by_task["new_road"]:
         cells = [name]
-        for task in tasks:
+        for task in DRIVEN:
             line = by_task[task][name]
             cells.append(number(line["rmse_speed"], "rmse_speed"))
             cells.append(number(line["rmse_gap"], "rmse_gap"))
@@ -481,7 +487,7 @@ def by_site(task: str) -> list[str]:
 def verdicts() -> list[str]:
     """Returns the verdict of each task of `roads`."""
     lines = []
-    for task in ("new_road", "same_road", "known", "forecast"):
+    for task in (*DRIVEN, "forecast"):
         verdict = standing(task)["verdict"]
         lines.append(f"- `{task}`: {verdict[0].lower()}{verdict[1:]}")
     return lines
