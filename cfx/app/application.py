@@ -16,8 +16,7 @@ import sys
 import time
 import traceback
 import uuid
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -151,12 +150,7 @@ class JobFunction:
                     judge = judge_of_folder(folder).name
                     return main_error(metrics_of(folder), judge), status
                 (folder / STATUS).unlink(missing_ok=True)  # what it says is no longer so
-            # Importing these takes a tenth of a second and more, which `--help` does not wait for.
-            from cfx.app.job.run import run_job
-            from cfx.results.config import JobConfig
-
-            with plugins_blamed():
-                result = (self.run_job or run_job)(JobConfig.of(values), folder)
+            result = _run_job(values, folder, self.run_job)
         except (Exception, SystemExit) as error:
             status = self._failed(error, blank)
             if status.code == CfxError.exit_code:
@@ -285,11 +279,8 @@ def run(overrides: Sequence[str] = (), *, run_job: RunJob | None = None) -> Resu
                 folder = new_folder(Path(str(config.hydra.run.dir)).absolute())
         messages = logging.FileHandler(folder / "cfx.log", encoding="utf-8")
         messages.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
-        from cfx.app.job.run import run_job as own_job
-        from cfx.results.config import JobConfig
-
-        with console_logging(handler=messages), plugins_blamed():
-            return (run_job or own_job)(JobConfig.of(values), folder)
+        with console_logging(handler=messages):
+            return _run_job(values, folder, run_job)
 
 
 def wants_traceback(arguments: Sequence[str]) -> bool:
@@ -303,15 +294,18 @@ def wants_traceback(arguments: Sequence[str]) -> bool:
     return False
 
 
-@contextmanager
-def plugins_blamed() -> Iterator[None]:
-    """Attributes what a plugin raises in the block to its distribution.
+def _run_job(values: Mapping[str, Any], folder: Path, run_job: RunJob | None) -> Result:
+    """Runs a job; what a plugin raises is attributed to its distribution.
 
     Raises:
         CfxError: the user's mistake, with the plugin's distribution; or memory ran out.
     """
+    # Importing these takes a tenth of a second and more, which `--help` does not wait for.
+    from cfx.app.job.run import run_job as run_own_job
+    from cfx.results.config import JobConfig
+
     try:
-        yield
+        return (run_job or run_own_job)(JobConfig.of(values), folder)
     except CfxError:
         raise
     except (Exception, SystemExit) as error:  # a plugin may raise anything
