@@ -6,6 +6,9 @@ driver's acceleration and jerk, so noise there makes jolts. The replacement is a
 average of the past, smoothed twice so that it has a jerk too (R. G. Brown 1959, Statistical
 forecasting for inventory control), with the time constant that best predicts the change of speed,
 times the coefficient of that regression.
+
+Coefficient and average are rounded to `_DECIMALS`: the last bits of a dot product depend on the
+processor (OpenBLAS has a kernel for each), and a recording must have one fingerprint everywhere.
 """
 
 from __future__ import annotations
@@ -40,6 +43,9 @@ _LOOKED_AT_S = 60.0
 _LEAST_S = 5.0
 """A shorter pair is left as it is."""
 
+_DECIMALS = 6
+"""Of what is computed here: far finer than any recording, far coarser than rounding errors."""
+
 _NOTHING = 1e-12
 """(m/s)2; below it nothing is divided by."""
 
@@ -62,7 +68,7 @@ class Average(NamedTuple):
         """Returns the average of values `(T,)` at each frame, of its past alone; `dt` in s."""
         if self.constant == 0:
             return values
-        return self.factor * smoothed_twice(values, self.constant, dt)
+        return np.round(self.factor * smoothed_twice(values, self.constant, dt), _DECIMALS)
 
 
 RECORDED = Average(0.0, 1.0)
@@ -140,7 +146,7 @@ def best_average(speed: Floats, acceleration: Floats, dt: float) -> Average:
         factor = 1.0
         if constant > 0:
             scale = max(float(expected @ expected), _NOTHING)
-            factor = min(1.0, max(0.0, float(follows @ expected) / scale))
+            factor = round(min(1.0, max(0.0, float(follows @ expected) / scale)), _DECIMALS)
         error = float(np.square(follows - factor * expected).mean())
         return error, Average(constant, factor)
 

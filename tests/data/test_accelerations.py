@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import logging
+import os
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -58,6 +61,30 @@ def test_the_average_is_a_critically_damped_filter(values: list[float], constant
 def test_an_acceleration_that_says_nothing_counts_for_nothing() -> None:
     noise = np.random.default_rng(1).normal(0, 1, 600)
     assert best_average(np.full(600, 15.0), noise, DT).factor < 0.1
+
+
+_FINGERPRINT = """
+from tests.data.test_accelerations import fingerprint_of_noisy_pairs
+print(fingerprint_of_noisy_pairs())
+"""
+
+
+def fingerprint_of_noisy_pairs() -> str:
+    pairs = straight_pairs([600])
+    for seed in range(8):
+        noise = np.random.default_rng(seed).normal(0, 2, 600)
+        pair = replace(pairs[0], pair_id=str(seed), follower_speed=SPEED)
+        pair = replace(pair, follower_acceleration=ACCELERATION + noise)
+        pairs = replace(pairs, pairs=(*pairs.pairs, pair))
+    return with_usable_accelerations(pairs, "smooth").fingerprint
+
+
+def test_every_processor_computes_the_same_averages() -> None:
+    # OpenBLAS adds up a dot product in another order where it takes the processor for another one.
+    older = {**os.environ, "OPENBLAS_CORETYPE": "Prescott"}
+    words = [sys.executable, "-c", _FINGERPRINT]
+    done = subprocess.run(words, env=older, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == fingerprint_of_noisy_pairs()
 
 
 def test_pairs_too_short_to_tell_are_left_alone() -> None:

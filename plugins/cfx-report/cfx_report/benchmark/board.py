@@ -135,7 +135,7 @@ def standings(rows: Sequence[Entered]) -> list[Standing]:
             f"scores are relative to the row '{suite.baseline}'; give its folder too (cfx benchmark"
             f" --suite {suite.name} model=idm makes it)"
         )
-    found = []
+    ranked = []
     for task in suite.tasks:
         errors = {}
         for name, entered in by_name.items():
@@ -143,8 +143,8 @@ def standings(rows: Sequence[Entered]) -> list[Standing]:
             if len(judged):
                 errors[name] = judged
         if suite.baseline in errors:
-            found.append(_standing(suite, task, errors, by_name))
-    return found
+            ranked.append(_standing(suite, task, errors, by_name))
+    return ranked
 
 
 def judged_errors(suite: Suite, task: Task, errors: pd.DataFrame) -> pd.DataFrame:
@@ -153,15 +153,15 @@ def judged_errors(suite: Suite, task: Task, errors: pd.DataFrame) -> pd.DataFram
     It is the RMSE of speed; of forecasts the CRPS of speed, in the geometric mean over horizons.
     """
     if task.kind != "forecast":
-        found = errors[errors["task"] == task.name].copy()
-        found["error"] = found["rmse_speed"].clip(lower=_LEAST_MPS)
+        judged = errors[errors["task"] == task.name].copy()
+        judged["error"] = judged["rmse_speed"].clip(lower=_LEAST_MPS)
     else:
         horizons = [horizon_task(horizon) for horizon in suite.horizons]
-        some = errors[errors["task"].isin(horizons)].copy()
-        some["error"] = _logarithm(some["crps_speed"].clip(lower=_LEAST_MPS))
+        forecasts = errors[errors["task"].isin(horizons)].copy()
+        forecasts["error"] = _logarithm(forecasts["crps_speed"].clip(lower=_LEAST_MPS))
         labels = ["pair_id", "driver", "site", "frames"]
-        found = some.groupby(labels, sort=False)["error"].mean().map(math.exp).reset_index()
-    return found[["pair_id", "driver", "site", "frames", "error"]]
+        judged = forecasts.groupby(labels, sort=False)["error"].mean().map(math.exp).reset_index()
+    return judged[["pair_id", "driver", "site", "frames", "error"]]
 
 
 def _logarithm(values: pd.Series) -> pd.Series:
@@ -195,7 +195,7 @@ def _standing(
         sites[name] = judged.groupby("site", sort=False)["error"].mean()
     table = pd.DataFrame(lines).sort_values("score", ascending=False, ignore_index=True)
     site_of = dict(zip(baseline.index, baseline["site"], strict=True))
-    ranking = statistics.ranking_of({name: [one] for name, one in errors.items()}, site_of)
+    ranking = statistics.ranking_of({name: [pairs] for name, pairs in errors.items()}, site_of)
     by_site = pd.DataFrame(sites).T.reindex(table["row"])
     return Standing(task, table, by_site, statistics.verdict(ranking))
 

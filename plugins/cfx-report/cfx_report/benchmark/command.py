@@ -25,68 +25,68 @@ class BenchmarkCommand(Command):
     summary = "a model, a policy or a rival on a frozen benchmark, beside all others"
 
     def parser(self) -> argparse.ArgumentParser:
-        made = argparse.ArgumentParser(
+        parser = argparse.ArgumentParser(
             "cfx benchmark",
             description="Runs a frozen protocol, and writes a row. cfx benchmark table prints rows,"
             " and writes the page of them.",
             epilog="cfx benchmark model=mine --data i80_reconstructed_pairs.parquet; cfx benchmark"
             " --suite roads rival=ridge --data FOLDER",
         )
-        made.add_argument(
+        parser.add_argument(
             "overrides",
             nargs="*",
             metavar="OVERRIDE",
             help="what is benchmarked: model=, policy=, learner=, objective= and their settings; or"
             " rival= and its settings",
         )
-        made.add_argument(
+        parser.add_argument(
             "--suite",
             choices=["i80", "roads"],
             default="i80",
             help="i80: one recording; roads: every openly licensed one; default: i80",
         )
-        made.add_argument(
+        parser.add_argument(
             "--data", metavar="PATH", help="the recordings, tidy tables: a file, or their folder"
         )
-        made.add_argument(
+        parser.add_argument(
             "--method",
             choices=list(METHODS),
             help="how the model is used; default: constant, unless policy= or learner= is given",
         )
-        made.add_argument("--quick", action="store_true", help="of roads: two roads alone")
-        made.add_argument(
+        parser.add_argument("--quick", action="store_true", help="of roads: two roads alone")
+        parser.add_argument(
             "--all", action="store_true", help="every row of the documentation, one after the other"
         )
-        made.add_argument("--seed", type=int, default=0, help="of training; default: 0")
-        made.add_argument("--name", help="of the row; default: made of the overrides")
-        made.add_argument(
+        parser.add_argument("--seed", type=int, default=0, help="of training; default: 0")
+        parser.add_argument("--name", help="of the row; default: made of the overrides")
+        parser.add_argument(
             "--output",
             type=Path,
             metavar="FOLDER",
             help="of the row; default: outputs/benchmark/NAME, of roads"
             " outputs/benchmark/roads-1/NAME, where the baseline's row and the recordings lie too",
         )
-        made.add_argument(
+        parser.add_argument(
             "--submission",
             nargs="+",
             type=Path,
             metavar="FILE",
             help="score these trajectories and forecasts (Parquet) in place of a method",
         )
-        made.add_argument(
+        parser.add_argument(
             "--card", type=Path, metavar="FILE", help="of a submission: JSON, who and how"
         )
-        made.add_argument(
+        parser.add_argument(
             "--against",
             action="append",
             default=[],
             metavar="FILE",
             help="another's benchmark_pairs.csv, to compare with pair by pair; may be repeated",
         )
-        made.add_argument(
+        parser.add_argument(
             "--other-data", action="store_true", help="allow other pairs, and mark the row"
         )
-        return made
+        return parser
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
         """Reads the command line, where overrides may stand between options."""
@@ -200,17 +200,17 @@ class TableCommand(Command):
     summary = "rows of the benchmark as one table, and as a page"
 
     def parser(self) -> argparse.ArgumentParser:
-        made = argparse.ArgumentParser("cfx benchmark table", description=self.__doc__)
-        made.add_argument(
+        parser = argparse.ArgumentParser("cfx benchmark table", description=self.__doc__)
+        parser.add_argument(
             "rows", nargs="+", type=Path, metavar="ROW", help="folders of rows, or benchmark.json"
         )
-        made.add_argument(
+        parser.add_argument(
             "--page", type=Path, metavar="FILE", help="write the leaderboard as one HTML file"
         )
-        made.add_argument(
+        parser.add_argument(
             "--json", type=Path, metavar="FILE", help="write what is printed, and more, as data"
         )
-        return made
+        return parser
 
     def run(self, options: argparse.Namespace) -> int:
         from cfx_report.benchmark.board import Entered, lines_of_rows, write_standings
@@ -233,37 +233,37 @@ class PublishedCommand(Command):
     summary = "a method on published splits, beside the published numbers"
 
     def parser(self) -> argparse.ArgumentParser:
-        made = argparse.ArgumentParser("cfx benchmark published", description=self.__doc__)
-        made.add_argument(
+        parser = argparse.ArgumentParser("cfx benchmark published", description=self.__doc__)
+        parser.add_argument(
             "split",
             choices=["segments", "transfollower", "follownet", "opencf"],
             help="whose; opencf writes a submission for OpenCF-Benchmark",
         )
-        made.add_argument(
+        parser.add_argument(
             "overrides",
             nargs="+",
             metavar="OVERRIDE",
             help="model=, rival= and their settings; or driver=cfx://idm, or a job's folder",
         )
-        made.add_argument("--learn", nargs="+", type=Path, metavar="FILE", help="to learn from")
-        made.add_argument(
+        parser.add_argument("--learn", nargs="+", type=Path, metavar="FILE", help="to learn from")
+        parser.add_argument(
             "--test", nargs="+", type=Path, metavar="FILE", required=True, help="to be driven"
         )
-        made.add_argument(
+        parser.add_argument(
             "--pairs",
             type=Path,
             metavar="FILE",
             help="text: the ids of the tested pairs, one a line",
         )
-        made.add_argument(
+        parser.add_argument(
             "--output",
             type=Path,
             metavar="FILE",
             help="CSV: errors of each pair, or the submission",
         )
-        made.add_argument("--samples", type=int, default=6, help="of opencf; default: 6")
-        made.add_argument("--seed", type=int, default=0, help="of training; default: 0")
-        return made
+        parser.add_argument("--samples", type=int, default=6, help="of opencf; default: 6")
+        parser.add_argument("--seed", type=int, default=0, help="of training; default: 0")
+        return parser
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
         """Reads the command line, where overrides may stand between options."""
@@ -291,12 +291,14 @@ class PublishedCommand(Command):
             return 0
         tested = published.read(options.test, options.pairs)
         learned = published.read(options.learn, None) if options.learn else None
-        found = published.scores(entry, learned, tested, options.seed)
-        print("\n".join(published.lines(published.SPLITS[options.split], entry.name, found)))
+        errors = published.scores(entry, learned, tested, options.seed)
+        print("\n".join(published.lines(published.SPLITS[options.split], entry.name, errors)))
         if options.output is not None:
             from cfx.plugin import files
 
-            files.write_output(options.output, found.to_csv(index=False), "the errors of each pair")
+            files.write_output(
+                options.output, errors.to_csv(index=False), "the errors of each pair"
+            )
         return 0
 
 
@@ -306,16 +308,16 @@ class WatchCommand(Command):
     summary = "what some seconds of watching a driver bring"
 
     def parser(self) -> argparse.ArgumentParser:
-        made = argparse.ArgumentParser("cfx benchmark watch", description=self.__doc__)
-        made.add_argument("overrides", nargs="+", metavar="OVERRIDE", help="as of cfx benchmark")
-        made.add_argument("--data", type=Path, metavar="FOLDER", required=True, help="recordings")
-        made.add_argument("--method", choices=list(METHODS), help="how a model is used")
-        made.add_argument("--quick", action="store_true", help="two roads alone")
-        made.add_argument("--seed", type=int, default=0, help="of training; default: 0")
-        made.add_argument(
+        parser = argparse.ArgumentParser("cfx benchmark watch", description=self.__doc__)
+        parser.add_argument("overrides", nargs="+", metavar="OVERRIDE", help="as of cfx benchmark")
+        parser.add_argument("--data", type=Path, metavar="FOLDER", required=True, help="recordings")
+        parser.add_argument("--method", choices=list(METHODS), help="how a model is used")
+        parser.add_argument("--quick", action="store_true", help="two roads alone")
+        parser.add_argument("--seed", type=int, default=0, help="of training; default: 0")
+        parser.add_argument(
             "--other-data", action="store_true", help="allow other pairs than the suite's"
         )
-        return made
+        return parser
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
         """Reads the command line, where overrides may stand between options."""
@@ -332,6 +334,8 @@ class WatchCommand(Command):
         source = options.data.expanduser().absolute()
         recordings = Recordings.read(suite, source, other_data=options.other_data)
         folder = folder_of(suite, entry.name)
-        found = watch(entry, recordings, folder, options.seed, SECONDS)
-        print("\n".join(["", *lines(found), "", f"Errors of each pair: {folder / 'watching.csv'}"]))
+        errors = watch(entry, recordings, folder, options.seed, SECONDS)
+        print(
+            "\n".join(["", *lines(errors), "", f"Errors of each pair: {folder / 'watching.csv'}"])
+        )
         return 0

@@ -53,7 +53,7 @@ def compared(
     Raises:
         DataError: the other pairs or their protocol are not mine.
     """
-    found: dict[tuple[str, str], Improvement] = {}
+    improvements: dict[tuple[str, str], Improvement] = {}
     protocol = mine["protocol"].iloc[0]
     tasks = list(mine.groupby("task", sort=False))
     for name, other in others.groupby("row", sort=False):
@@ -67,8 +67,8 @@ def compared(
             of_task = _compared(table, other[other["task"] == task], f"{source}, row '{name}'")
             for metric, improvement in of_task.items():
                 label = metric if len(tasks) == 1 else f"{task}/{metric}"
-                found[str(name), label] = improvement
-    return found
+                improvements[str(name), label] = improvement
+    return improvements
 
 
 def _compared(mine: pd.DataFrame, other: pd.DataFrame, source: str) -> dict[str, Improvement]:
@@ -82,31 +82,31 @@ def _compared(mine: pd.DataFrame, other: pd.DataFrame, source: str) -> dict[str,
             f"{source}: has {len(other)} pairs, of which {len(both)} are among my {len(mine)}; the"
             " benchmark compares all of them"
         )
-    found = {}
+    improvements = {}
     for metric in mine.columns:
         if metric in _LABELS or metric in COUNTS or mine[metric].isna().all():
             continue
         if f"{metric}_other" not in both:
             raise DataError(f"{source}: column {metric} is missing")
-        found[str(metric)] = statistics.improvement_statistics(
+        improvements[str(metric)] = statistics.improvement_statistics(
             both[f"{metric}_other"].to_numpy(float),
             both[metric].to_numpy(float),
             both["driver"].astype(str).tolist(),
         )
-    return found
+    return improvements
 
 
-def lines_of(found: dict[tuple[str, str], Improvement]) -> list[str]:
+def lines_of(improvements: dict[tuple[str, str], Improvement]) -> list[str]:
     """Returns a comparison as a Markdown table."""
     lines = [
         "| against | error | smaller by | 95 % interval | pairs won | p |",
         "| --- | --- | --- | --- | --- | --- |",
     ]
-    for (row, metric), one in found.items():
+    for (row, metric), improvement in improvements.items():
         # 0.0 is added so that no difference is +0.0 %, not -0.0 %.
-        interval = f"{one.ci95_low + 0.0:+.1%} to {one.ci95_high + 0.0:+.1%}"
+        interval = f"{improvement.ci95_low + 0.0:+.1%} to {improvement.ci95_high + 0.0:+.1%}"
         lines.append(
-            f"| {row} | {metric} | {one.geometric + 0.0:+.1%} | {interval} |"
-            f" {one.win_rate:.0%} of {one.pairs} | {one.p_value:.2g} |"
+            f"| {row} | {metric} | {improvement.geometric + 0.0:+.1%} | {interval} |"
+            f" {improvement.win_rate:.0%} of {improvement.pairs} | {improvement.p_value:.2g} |"
         )
     return lines

@@ -41,8 +41,8 @@ def entry_of(method: str | None, overrides: Sequence[str], name: str | None, see
     if any(word.partition("=")[0] == "rival" for word in overrides):
         if method is not None:
             raise ConfigError("--method says how a model of cfx is used; a rival has none")
-        made = name or ", ".join(word.removeprefix("rival=") for word in overrides) + suffix
-        return RivalEntry(made, tuple(overrides), _rival(overrides))
+        row = name or ", ".join(word.removeprefix("rival=") for word in overrides) + suffix
+        return RivalEntry(row, tuple(overrides), _rival(overrides))
     if any(word.startswith("driver=") for word in overrides):
         if len(overrides) != 1 or method is not None:
             raise ConfigError(f"{overrides[0]} stands alone: it brings its model and its settings")
@@ -51,8 +51,8 @@ def entry_of(method: str | None, overrides: Sequence[str], name: str | None, see
         return ReadyEntry(name or run, tuple(overrides), agent)
     require_free(overrides)
     words = overrides_of(method, overrides)
-    made = name or row_name(method, overrides) + suffix
-    return JobEntry(made, tuple(of_method(words)), tuple(words))
+    row = name or row_name(method, overrides) + suffix
+    return JobEntry(row, tuple(of_method(words)), tuple(words))
 
 
 def _rival(overrides: Sequence[str]) -> Rival:

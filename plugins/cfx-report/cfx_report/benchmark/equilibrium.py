@@ -49,8 +49,8 @@ def flow_errors(driver: Driver, dt: float) -> dict[str, float]:
     final = speed[:, -1].numpy().reshape(gap.shape)
     settled = (gap > 0) & (np.abs(final - speeds[:, None]) < 0.1 * speeds[:, None])
     flows = steady.flow(np.broadcast_to(speeds[:, None], gap.shape), np.where(settled, gap, 1.0))
-    known = np.isfinite(recorded)
-    error = np.where(settled, np.abs(flows / recorded[:, None] - 1.0), 1.0)[known]
+    is_recorded = np.isfinite(recorded)
+    error = np.where(settled, np.abs(flows / recorded[:, None] - 1.0), 1.0)[is_recorded]
     both = settled.all(1)
     apart = math.nan
     if both.any():

@@ -37,7 +37,7 @@ def overrides_of(method: str | None, given: Sequence[str]) -> list[str]:
     """
     if method is None:
         chooses = {"policy", "learner", "experiment"}
-        if any(one.partition("=")[0] in chooses for one in given):
+        if any(override.partition("=")[0] in chooses for override in given):
             return list(given)
         method = "constant"
     if method not in METHODS:
@@ -51,35 +51,35 @@ def overrides_of(method: str | None, given: Sequence[str]) -> list[str]:
 def row_name(method: str | None, given: Sequence[str]) -> str:
     """Returns what a row is called where its user gives it no name."""
     words = []
-    for one in of_method(given):
-        key, _, value = one.partition("=")
+    for override in of_method(given):
+        key, _, value = override.partition("=")
         if key in {"model", "policy", "learner", "experiment"}:
             words.append(value)
         else:
-            words.append(one)
+            words.append(override)
     if method is not None:
         words.append(method.replace("_", " "))
-    elif not any(one.startswith(("policy=", "learner=", "experiment=")) for one in given):
+    elif not any(override.startswith(("policy=", "learner=", "experiment=")) for override in given):
         words.append("constant")
     return ", ".join(words)
 
 
 def of_method(overrides: Sequence[str]) -> list[str]:
     """Returns the overrides without those that change no result."""
-    kept = []
-    for one in overrides:
-        if one.partition("=")[0].split(".")[0] not in _CHANGE_NOTHING:
-            kept.append(one)
-    return kept
+    relevant = []
+    for override in overrides:
+        if override.partition("=")[0].split(".")[0] not in _CHANGE_NOTHING:
+            relevant.append(override)
+    return relevant
 
 
 def require_free(overrides: Sequence[str]) -> None:
     """Raises ConfigError for an override of what is frozen."""
-    for one in overrides:
-        key = one.partition("=")[0].lstrip("+~")
+    for override in overrides:
+        key = override.partition("=")[0].lstrip("+~")
         if key != HISTORY and key.split(".")[0].split("@")[0] in FROZEN_KEYS:
             raise ConfigError(
-                f"cfx benchmark: {one}: pairs, folds, seed, split, windows and metrics are the"
+                f"cfx benchmark: {override}: pairs, folds, seed, split, windows and metrics are the"
                 " benchmark's; without them rows do not compare. A job of your own: python -m cfx"
             )
 

@@ -52,13 +52,16 @@ def render(rows: Sequence[Entered]) -> str:
     blocks: Any = environment.get_template("blocks.html.j2").module
     environment.globals["table"] = blocks.table
     suite = suite_of(rows)
-    found = standings(rows)
+    ranked = standings(rows)
     scripts = inline_scripts([asset(name) for name in _SCRIPTS])
     return environment.get_template("leaderboard.html.j2").render(
         suite=suite,
         protocol=rows[0].row.protocol,
         written=f"{datetime.now():%d %B %Y}".lstrip("0"),
-        tasks=[(one.task, task_sheet(one), site_sheet(one), one.verdict) for one in found],
+        tasks=[
+            (standing.task, task_sheet(standing), site_sheet(standing), standing.verdict)
+            for standing in ranked
+        ],
         cards=[entered.row for entered in rows if entered.row.card],
         drives=[
             (entered.row.name, Markup(svg))  # noqa: S704 - Matplotlib escapes all texts
@@ -109,13 +112,13 @@ def _shown(name: str) -> Any:
 
 def _pictures(rows: Sequence[Entered]) -> list[tuple[Entered, str]]:
     """Returns drawings of the best, the median and the worst drive of each row that has them."""
-    found = []
+    pictures = []
     for number, entered in enumerate(rows):
         path = entered.folder / DRIVES
         if path.is_file():
             svg = inline_svg(_drawn(pd.read_parquet(path)))
-            found.append((entered, svg.replace(PLACE, f"row{number}-")))
-    return found
+            pictures.append((entered, svg.replace(PLACE, f"row{number}-")))
+    return pictures
 
 
 @canvas.styled

@@ -213,17 +213,21 @@ class AgentDriver(Driver):
         agent: of a job, with a network or pooled parameters for each fold.
         number: of the fold.
         settings: of calibration, as `cfx.calibrate` takes them, for drivers whose past is given.
-        own: their parameters, `(P, n)`, SI units; None: nothing is known of anybody.
+        driver_specific: their parameters, `(P, n)`, SI units; None: nothing is known of anybody.
     """
 
     def __init__(
-        self, agent: Agent, number: int, settings: Mapping[str, Any], own: Tensor | None = None
+        self,
+        agent: Agent,
+        number: int,
+        settings: Mapping[str, Any],
+        driver_specific: Tensor | None = None,
     ) -> None:
         self.agent = agent
         self.number = number
         self.is_stochastic = agent.core.head.is_stochastic
         self._settings = settings
-        self._own = own
+        self._driver_specific = driver_specific
         self._model = cast(DrivingModel, registry.create("model", agent.model_node))
 
     @property
@@ -231,11 +235,11 @@ class AgentDriver(Driver):
         return isinstance(self.agent.core.policy, FixedPolicy)
 
     def drive(self, batch: PairBatch, first: Tensor, seed: int | None) -> Tensor:
-        if self._own is not None and self._is_constant:
-            return self._with_own(batch, first)
+        if self._driver_specific is not None and self._is_constant:
+            return self._with_driver_specific(batch, first)
         base = None
-        if self._own is not None:
-            base = base_of(self.agent, self._own)
+        if self._driver_specific is not None:
+            base = base_of(self.agent, self._driver_specific)
         network = torch.full_like(first, self.number)
         # A policy reads as much of the past as it has learned to. Those that learned from cold
         # starts alone err more after they have read, by 1 % in the suite's task `known`.
@@ -253,7 +257,7 @@ class AgentDriver(Driver):
         )
         return on_frames(paths.speed[0], batch, first)
 
-    def _with_own(self, batch: PairBatch, first: Tensor) -> Tensor:
+    def _with_driver_specific(self, batch: PairBatch, first: Tensor) -> Tensor:
         """Drives each follower with constant parameters of their own."""
         columns = torch.arange(int((batch.lengths - first).max()))
         index = (first[:, None] + columns).clamp(max=batch.mask.shape[1] - 1)
@@ -266,7 +270,9 @@ class AgentDriver(Driver):
             batch.leader_acceleration.gather(1, index),
             batch.leader_length,
         )
-        driven = simulate_follower(self._model, self._own, leader, Start(*start), batch.dt)
+        driven = simulate_follower(
+            self._model, self._driver_specific, leader, Start(*start), batch.dt
+        )
         return on_frames(driven.speed, batch, first)
 
     def adapted(self, past: PairSet, seed: int) -> Driver:

@@ -116,7 +116,7 @@ def read_opencf(source: Path) -> tuple[PairSet, pd.DataFrame]:
     for name, rows in table.sort_values("Time").groupby("CF_pair_id", sort=False):
         if len(rows) < round(_KNOWN_S / 0.1) + 2:
             raise DataError(f"{source}: pair {name} ends before 3.0 s, where prediction begins")
-        known = rows["follower_dist"].notna().to_numpy()
+        is_known = rows["follower_dist"].notna().to_numpy()
         speed = rows["follower_speed"].ffill().to_numpy(float)
         start = float(rows["follower_dist"].iloc[0])
         pairs.append(
@@ -131,7 +131,7 @@ def read_opencf(source: Path) -> tuple[PairSet, pd.DataFrame]:
                 leader_position=rows["leader_dist"].to_numpy(float),
                 leader_speed=rows["leader_speed"].to_numpy(float),
                 leader_acceleration=rows["leader_acceleration"].to_numpy(float),
-                follower_position=np.where(known, rows["follower_dist"], start),
+                follower_position=np.where(is_known, rows["follower_dist"], start),
                 follower_speed=speed,
                 follower_acceleration=np.gradient(speed, 0.1),
             )

@@ -15,21 +15,23 @@ class MakePolicies(Command):
     summary = "train ready-made policies anew and write them into the package"
 
     def parser(self) -> argparse.ArgumentParser:
-        made = argparse.ArgumentParser(
+        parser = argparse.ArgumentParser(
             "cfx policies make",
             description="Trains ready-made policies anew and writes them into the package.",
         )
-        made.add_argument(
+        parser.add_argument(
             "names", nargs="*", help=f"of {', '.join(RECIPES)}; all of them if left out"
         )
-        made.add_argument("--data", type=Path, required=True, help="the folder with the recordings")
-        made.add_argument(
+        parser.add_argument(
+            "--data", type=Path, required=True, help="the folder with the recordings"
+        )
+        parser.add_argument(
             "--work",
             type=Path,
             default=Path("outputs/policies"),
             help="where jobs run; finished ones are not run again",
         )
-        return made
+        return parser
 
     def run(self, options: argparse.Namespace) -> int:
         from cfx_report.benchmark.publish import make

@@ -258,12 +258,12 @@ def _sites(table: pd.DataFrame) -> list[dict[str, Any]]:
     """Returns the rows of `sites.csv` for a card; what is not known is left out."""
     rows = []
     for row in table.to_dict("records"):
-        known = {}
+        values = {}
         for name in _SITE_COLUMNS:
             value = row.get(name)
             if isinstance(value, str) or (value is not None and math.isfinite(value)):
-                known[name] = value
-        rows.append(known)
+                values[name] = value
+        rows.append(values)
     return rows
 
 
@@ -278,10 +278,10 @@ def _distributions(metrics: dict[str, Any]) -> list[dict[str, float]]:
     rows = []
     pattern = re.compile(r"distribution/crps_speed_(?P<seconds>[0-9.]+)s/policy")
     for name, value in metrics.items():
-        found = pattern.fullmatch(name)
-        coverage = f"distribution/coverage_{found['seconds']}s/policy" if found else ""
-        if found and coverage in metrics:
-            row = {"horizon_s": float(found["seconds"]), "crps_speed": value}
+        match = pattern.fullmatch(name)
+        coverage = f"distribution/coverage_{match['seconds']}s/policy" if match else ""
+        if match and coverage in metrics:
+            row = {"horizon_s": float(match["seconds"]), "crps_speed": value}
             rows.append({**row, "coverage": metrics[coverage]})
     return sorted(rows, key=lambda row: row["horizon_s"])
 
@@ -292,19 +292,19 @@ def _limits(agent: Agent) -> dict[str, Any]:
 
 
 def _range(agent: Agent) -> dict[str, Any]:
-    found = agent.valid_range
-    if found is None:
+    valid = agent.valid_range
+    if valid is None:
         return {}
     bounds = {}
     for number, signal in enumerate(valid_range.RANGE_SIGNALS):
-        low, high = found.low[0, number], found.high[0, number]
+        low, high = valid.low[0, number], valid.high[0, number]
         name = signal
         if signal == "log_gap":
             name, low, high = "gap", torch.expm1(low), torch.expm1(high)
         bounds[name] = [round(float(low), 2), round(float(high), 2)]
     return {
         "usual": bounds,
-        "mahalanobis_distance": float(found.distance[0]),
+        "mahalanobis_distance": float(valid.distance[0]),
         "faded_at": valid_range.FADED,
     }
 
@@ -339,8 +339,8 @@ def _stress(folder: Path) -> dict[str, Any]:
         done = subprocess.run(command, check=False, stdout=subprocess.DEVNULL)  # noqa: S603
         if done.returncode:
             raise DataError(f"{folder}: the stress scenario failed; its words stand above")
-        found: dict[str, Any] = json.loads(output.read_text(encoding="utf-8"))
-    return found
+        measured: dict[str, Any] = json.loads(output.read_text(encoding="utf-8"))
+    return measured
 
 
 def _traffic(name: str, folder: Path) -> dict[str, Any]:

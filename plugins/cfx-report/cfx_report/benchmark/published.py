@@ -151,20 +151,20 @@ def _errors(segments: Segments, simulated: pd.DataFrame) -> pd.DataFrame:
         collides=simulated["gap_m"] < 0.0,
     )
     grouped = table.groupby("pair_id", sort=False)
-    found = pd.DataFrame(
+    errors = pd.DataFrame(
         {
             "mse_speed": grouped["square_speed"].mean(),
             "mse_gap": grouped["square_gap"].mean(),
             "collision_share": grouped["collides"].max().astype(float),
         }
     )
-    found["mse_sum"] = found["mse_speed"] + found["mse_gap"]
-    found["rmse_speed"] = np.sqrt(found["mse_speed"])
-    found["rmse_gap"] = np.sqrt(found["mse_gap"])
-    return found.reset_index()
+    errors["mse_sum"] = errors["mse_speed"] + errors["mse_gap"]
+    errors["rmse_speed"] = np.sqrt(errors["mse_speed"])
+    errors["rmse_gap"] = np.sqrt(errors["mse_gap"])
+    return errors.reset_index()
 
 
-def lines(split: Published, name: str, found: pd.DataFrame) -> list[str]:
+def lines(split: Published, name: str, errors: pd.DataFrame) -> list[str]:
     """Returns a row's numbers beside the published ones, as Markdown."""
     heads = {
         "rmse_gap": "RMSE of gap [m]",
@@ -174,10 +174,10 @@ def lines(split: Published, name: str, found: pd.DataFrame) -> list[str]:
         "mse_sum": "MSE of speed and gap, summed",
         "collision_share": "share with a collision",
     }
-    lines = [f"{split.title}: {len(found)} pairs; {split.note}", ""]
-    if split.pairs not in {None, len(found)}:
+    lines = [f"{split.title}: {len(errors)} pairs; {split.note}", ""]
+    if split.pairs not in {None, len(errors)}:
         lines[-1:] = [
-            f"These are {len(found)} pairs, and {split.pairs} were published: they are others, and"
+            f"These are {len(errors)} pairs, and {split.pairs} were published: they are others, and"
             f" the published numbers do not compare. {split.source}.",
             "",
         ]
@@ -185,7 +185,7 @@ def lines(split: Published, name: str, found: pd.DataFrame) -> list[str]:
         f"| row | {' | '.join(heads[metric] for metric in split.metrics)} |",
         "|" + " --- |" * (1 + len(split.metrics)),
     ]
-    mine = tuple(float(found[metric].mean()) for metric in split.metrics)
+    mine = tuple(float(errors[metric].mean()) for metric in split.metrics)
     for row, values in ((f"{name} (now)", mine), *split.rows):
         cells = [f"{value:.3f}" for value in values]
         lines.append(f"| {row} | {' | '.join(cells)} |")

@@ -51,7 +51,7 @@ ROADS = Suite(
     sites=SITES,
     schemes=(NEW_ROAD, SAME_ROAD),
     tasks=TASKS,
-    fingerprint="936f776bb0dc92dbdde173b0b06d56d76fc5c59f8b6186eada6fbea4d81c7919",
+    fingerprint="ef72556ce498da880c0f442acd77d7baf7f566520133d779ea6bfac439060481",
     about="seven recordings of six roads: 483 pairs of 374 drivers",
 )
 
@@ -60,7 +60,7 @@ QUICK = replace(
     version="roads-1-quick",
     files=("openacc_vicolungo_pairs.parquet", "openacc_ispra_low_speed_pairs.parquet"),
     longest=2,
-    fingerprint="98b1365a56c18817da41ef0d47d0b3186ae2c24c0517b2286eca7b19664d3cfd",
+    fingerprint="aa3713543a3cd3abecce30c7f044f7b12ab3ac73b6caf45056721f0ced762fc2",
     about="Vicolungo and Ispra: 16 pairs",
 )
 """Two roads in two minutes, to see that a rival works. Its rows compare with one another alone."""

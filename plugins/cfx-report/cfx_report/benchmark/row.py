@@ -74,10 +74,10 @@ class Row:
         """
         try:
             values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            found = {}
+            by_metric = {}
             for name, (value, low, high) in values.pop("values").items():
-                found[name] = (float(value), low, high)
-            return cls(values=found, **values)
+                by_metric[name] = (float(value), low, high)
+            return cls(values=by_metric, **values)
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise DataError(f"{path}: is no row of the benchmark ({error})") from None
 
@@ -119,7 +119,7 @@ def markdown(rows: Sequence[Row]) -> list[str]:
         "| row | RMSE of speed [m/s] | RMSE of the gap [m] | collisions | braking frames |",
         "| --- | --- | --- | --- | --- |",
     ]
-    for row in sorted(rows, key=lambda one: one.values["rmse_speed"][0]):
+    for row in sorted(rows, key=lambda row: row.values["rmse_speed"][0]):
         name = row.name
         if row.protocol != I80.protocol:
             name += f" (other pairs: {row.data})"

@@ -94,9 +94,9 @@ def _trajectory_errors(
     row = _places(table["pair_id"], segments.pair_ids, source, task.name)
     frame = np.rint(table["time_s"].to_numpy() / batch.dt).astype(np.int64)
     counted = batch.mask & (torch.arange(shape[1]) > segments.first[:, None])
-    asked = counted.numpy()
+    is_scored = counted.numpy()
     inside = (frame >= 0) & (frame < shape[1])
-    inside[inside] = asked[row[inside], frame[inside]]
+    inside[inside] = is_scored[row[inside], frame[inside]]
     if not inside.all():
         at = int(np.flatnonzero(~inside)[0])
         wrong = table.iloc[at]
@@ -106,7 +106,7 @@ def _trajectory_errors(
         )
     given = np.zeros(shape, dtype=np.int64)
     np.add.at(given, (row, frame), 1)
-    _require_each(given, asked, segments, source, task.name)
+    _require_each(given, is_scored, segments, source, task.name)
     about = _about(suite, task.name, pairs)
     return _measured(about, segments, *_on_frames(batch, table, row, frame))
 
@@ -153,19 +153,21 @@ def _measured(about: pd.DataFrame, segments: Segments, speed: Tensor, gap: Tenso
         dt=batch.dt,
         space=ParameterSpace.of(),
     )
-    found = about.assign(frames=trajectories.counted.sum(1).numpy())
+    errors = about.assign(frames=trajectories.counted.sum(1).numpy())
     for name in METRICS:
-        found[name] = np.nan
+        errors[name] = np.nan
         if name in TRAJECTORY_METRICS:
             metric = registry.create("metric", {"name": name})
             assert isinstance(metric, Metric)
-            found[name] = metric.compute(trajectories).double().numpy()
-    return found
+            errors[name] = metric.compute(trajectories).double().numpy()
+    return errors
 
 
-def _places(pair_ids: pd.Series, known: Sequence[str], source: str, task: str) -> NDArray[np.int64]:
+def _places(
+    pair_ids: pd.Series, tested_ids: Sequence[str], source: str, task: str
+) -> NDArray[np.int64]:
     """Returns the number of the pair of each row."""
-    number = pd.Series(np.arange(len(known)), index=list(known))
+    number = pd.Series(np.arange(len(tested_ids)), index=list(tested_ids))
     unknown = ~pair_ids.isin(number.index)
     if unknown.any():
         row = pair_ids.index[int(np.flatnonzero(unknown)[0])]
@@ -177,13 +179,16 @@ def _places(pair_ids: pd.Series, known: Sequence[str], source: str, task: str) -
 
 def _require_each(
     given: NDArray[np.int64],
-    asked: NDArray[np.bool_],
+    is_scored: NDArray[np.bool_],
     segments: Segments,
     source: str,
     task: str,
 ) -> None:
-    """Raises DataError unless each frame that is asked for is given once."""
-    for wrong, what in ((given > 1, "stands there twice"), (asked & (given == 0), "is missing")):
+    """Raises DataError unless each scored frame is given once."""
+    for wrong, what in (
+        (given > 1, "stands there twice"),
+        (is_scored & (given == 0), "is missing"),
+    ):
         if wrong.any():
             row, frame = np.argwhere(wrong)[0]
             if not given[row].any():
@@ -295,10 +300,10 @@ def _quantile(ordered: Floats, levels: Floats, level: float) -> Floats:
 def _over_moments(scored: pd.DataFrame) -> pd.DataFrame:
     """Returns a row per pair: the root mean square error, mean CRPS and coverage of its moments."""
     grouped = scored.groupby(["task", "site", "pair_id", "driver"], sort=False)
-    found = grouped[["square", "crps_speed", "coverage"]].mean()
-    found["frames"] = grouped.size()
-    found["rmse_speed"] = np.sqrt(found.pop("square"))
-    table = found.reset_index()
+    means = grouped[["square", "crps_speed", "coverage"]].mean()
+    means["frames"] = grouped.size()
+    means["rmse_speed"] = np.sqrt(means.pop("square"))
+    table = means.reset_index()
     for name in METRICS:
         if name not in table.columns:
             table[name] = np.nan

@@ -67,11 +67,11 @@ def watch(
     if not parts:
         raise DataError(f"no pair lasts {max(seconds) + _LEAST_S:g} s")
     columns = ["watched_s", "site", "pair_id", "driver", "rmse_speed", "rmse_gap"]
-    found = pd.concat(parts, ignore_index=True)[columns]
+    errors = pd.concat(parts, ignore_index=True)[columns]
     folder.mkdir(parents=True, exist_ok=True)
     with files.atomic_write(folder / "watching.csv") as temporary:
-        found.to_csv(temporary, index=False)
-    return found
+        errors.to_csv(temporary, index=False)
+    return errors
 
 
 def _segments(pairs: Sequence[Pair], longest: float, past: float) -> Segments:
@@ -85,14 +85,14 @@ def _segments(pairs: Sequence[Pair], longest: float, past: float) -> Segments:
     return whole(PairSet(tuple(cut), "watched"), first)
 
 
-def lines(found: pd.DataFrame) -> list[str]:
+def lines(errors: pd.DataFrame) -> list[str]:
     """Returns the curve as Markdown: errors, and what watching brings, each site counting once."""
     table = [
         "| watched [s] | RMSE of speed [m/s] | RMSE of gap [m] | better than unwatched by (95 %) |",
         "| --- | --- | --- | --- |",
     ]
-    unwatched = found[found["watched_s"] == found["watched_s"].min()].set_index("pair_id")
-    for seconds, rows in found.groupby("watched_s"):
+    unwatched = errors[errors["watched_s"] == errors["watched_s"].min()].set_index("pair_id")
+    for seconds, rows in errors.groupby("watched_s"):
         here = rows.set_index("pair_id").loc[unwatched.index]
         gain = statistics.geometric_over_sites(
             unwatched["rmse_speed"].to_numpy(float),

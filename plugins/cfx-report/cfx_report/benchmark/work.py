@@ -98,6 +98,7 @@ def make_row(entry: Entry, recordings: Recordings, folder: Path, seed: int) -> R
     _claim(folder, [*entry.words, f"seed={seed}", recordings.protocol])
     if (folder / ROW).is_file():
         print(f"{folder}: was finished before", flush=True)
+        return Row.read(folder / ROW)
     recording = recordings.file_for_jobs(folder.parent)
     timings = []
     for scheme in suite.schemes:
@@ -247,8 +248,8 @@ def _fold(entry: Entry, training: Training, number: int) -> dict[str, dict[str, 
         )
         seconds = {"train": trained - began, "drive": driven - trained}
         files.write_json(done, {"seconds": seconds, "flows": flows})
-    found: dict[str, dict[str, float]] = json.loads(done.read_text(encoding="utf-8"))
-    return found
+    learned: dict[str, dict[str, float]] = json.loads(done.read_text(encoding="utf-8"))
+    return learned
 
 
 def _cpu_seconds() -> float:
