@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,9 @@ from cfx_report.benchmark.suite import Suite, Task
 
 SUITES = (I80, ROADS, QUICK)
 
+SAVED = ".parquet"
+"""How the name of a file of many rows ends."""
+
 _LEAST_MPS = 0.001
 """m/s: smaller errors count as this large: of drivers who stand all methods forecast that they
 stand, and a ratio of two zeros says nothing."""
@@ -36,7 +39,7 @@ class Entered:
     Attributes:
         row: what it says of itself.
         errors: of each task and pair.
-        folder: that holds them.
+        folder: that holds them, or the file of many rows that they were read from.
     """
 
     row: Row
@@ -52,6 +55,21 @@ class Entered:
         """
         path = place / ROW if place.is_dir() else place
         return cls(Row.read(path), read_errors(path.with_name(PAIRS)), path.parent)
+
+    @classmethod
+    def read_several(cls, places: Sequence[Path]) -> list[Entered]:
+        """Reads rows' folders, and files of many rows, which `save_rows` wrote.
+
+        Raises:
+            DataError: one is neither.
+        """
+        rows = []
+        for place in places:
+            if place.suffix == SAVED:
+                rows += _saved_rows(place)
+            else:
+                rows.append(cls.read(place))
+        return rows
 
 
 @dataclass(frozen=True)
@@ -247,6 +265,45 @@ def write_standings(rows: Sequence[Entered], path: Path) -> None:
         }
     commands = {entered.row.name: entered.row.command for entered in rows}
     files.write_json(path, {"protocol": suite.protocol, "commands": commands, "tasks": tasks})
+
+
+def save_rows(rows: Sequence[Entered], path: Path) -> None:
+    """Writes rows with the errors of each pair as one file, to be compared with elsewhere.
+
+    Errors are kept to seven digits (float32); pictures of drives are left out.
+
+    Raises:
+        DataError: the rows are of different protocols.
+        OutputError: the file cannot be written.
+    """
+    suite_of(rows)
+    errors = pd.concat([entered.errors for entered in rows], ignore_index=True)
+    numbers = errors.select_dtypes("float").columns
+    errors = errors.astype(dict.fromkeys(numbers, "float32"))
+    # pandas keeps these beside the columns.
+    errors.attrs["rows"] = [asdict(entered.row) for entered in rows]
+    with files.atomic_write(path) as temporary:
+        errors.to_parquet(temporary, index=False, compression="zstd")
+
+
+def _saved_rows(path: Path) -> list[Entered]:
+    """Reads a file that `save_rows` wrote.
+
+    Raises:
+        DataError: it is none.
+    """
+    try:
+        errors = pd.read_parquet(path)
+        rows = [Row.of(fields) for fields in errors.attrs["rows"]]
+        of_row = dict(list(errors.groupby("row", sort=False)))
+        entered = []
+        for row in rows:
+            entered.append(Entered(row, of_row[row.name].reset_index(drop=True), path.parent))
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
+        raise DataError(
+            f"{path}: is no file of rows, as cfx benchmark table --save writes it ({error})"
+        ) from None
+    return entered
 
 
 def markdown(standing: Standing) -> list[str]:

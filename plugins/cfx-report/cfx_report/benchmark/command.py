@@ -202,7 +202,11 @@ class TableCommand(Command):
     def parser(self) -> argparse.ArgumentParser:
         parser = argparse.ArgumentParser("cfx benchmark table", description=self.__doc__)
         parser.add_argument(
-            "rows", nargs="+", type=Path, metavar="ROW", help="folders of rows, or benchmark.json"
+            "rows",
+            nargs="+",
+            type=Path,
+            metavar="ROW",
+            help="folders of rows, benchmark.json, or a file of many rows (--save)",
         )
         parser.add_argument(
             "--page", type=Path, metavar="FILE", help="write the leaderboard as one HTML file"
@@ -210,16 +214,33 @@ class TableCommand(Command):
         parser.add_argument(
             "--json", type=Path, metavar="FILE", help="write what is printed, and more, as data"
         )
+        parser.add_argument(
+            "--save",
+            type=Path,
+            metavar="FILE.parquet",
+            help="write the rows with the errors of each pair as one file, which may be a ROW",
+        )
         return parser
 
-    def run(self, options: argparse.Namespace) -> int:
-        from cfx_report.benchmark.board import Entered, lines_of_rows, write_standings
+    def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
+        """Reads the command line."""
+        parser = self.parser()
+        options = parser.parse_args(list(arguments))
+        if options.save is not None and options.save.suffix != ".parquet":
+            parser.error(f"--save {options.save}: give the file a name that ends in .parquet")
+        return options
 
-        rows = [Entered.read(place) for place in options.rows]
+    def run(self, options: argparse.Namespace) -> int:
+        from cfx_report.benchmark.board import Entered, lines_of_rows, save_rows, write_standings
+
+        rows = Entered.read_several(options.rows)
         print("\n".join(lines_of_rows(rows)))
         if options.json is not None:
             write_standings(rows, options.json)
             print(f"\nAs data: {options.json}")
+        if options.save is not None:
+            save_rows(rows, options.save)
+            print(f"\nThe rows: {options.save}")
         if options.page is not None:
             from cfx_report.benchmark.leaderboard import write_page
 

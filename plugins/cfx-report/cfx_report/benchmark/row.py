@@ -73,13 +73,21 @@ class Row:
             DataError: the file is none.
         """
         try:
-            values: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-            by_metric = {}
-            for name, (value, low, high) in values.pop("values").items():
-                by_metric[name] = (float(value), low, high)
-            return cls(values=by_metric, **values)
+            return cls.of(json.loads(path.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
             raise DataError(f"{path}: is no row of the benchmark ({error})") from None
+
+    @classmethod
+    def of(cls, fields: Mapping[str, Any]) -> Row:
+        """Returns the row of its fields, as JSON has them.
+
+        Raises:
+            ValueError, TypeError, KeyError, AttributeError: they are none.
+        """
+        by_metric = {}
+        for name, (value, low, high) in fields["values"].items():
+            by_metric[name] = (float(value), low, high)
+        return cls(**{**fields, "values": by_metric})
 
 
 def values_of(errors: pd.DataFrame) -> dict[str, Value]:

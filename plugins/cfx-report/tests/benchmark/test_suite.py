@@ -327,6 +327,29 @@ def test_standings_are_written_with_what_tables_leave_out(rows: list[Path], tmp_
     assert len(left_out) == len(SMALL.horizons)
 
 
+def test_saved_rows_stand_as_their_folders_do(
+    rows: list[Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folders = [str(folder) for folder in rows]
+    assert main(["benchmark", "table", *folders]) == 0
+    of_folders = capsys.readouterr().out
+    saved = str(tmp_path / "rows.parquet")
+    assert main(["benchmark", "table", *folders, "--save", saved]) == 0
+    capsys.readouterr()
+    assert main(["benchmark", "table", saved]) == 0
+    assert capsys.readouterr().out == of_folders
+    # A row of one's own beside those of others.
+    assert main(["benchmark", "table", saved, folders[0]]) == 2
+    assert "two rows are called 'keeps'" in capsys.readouterr().err
+    table = pd.DataFrame({"row": ["keeps"]})
+    table.to_parquet(saved)
+    assert main(["benchmark", "table", saved]) == 2
+    assert "is no file of rows" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        main(["benchmark", "table", *folders, "--save", "rows.csv"])
+    assert "ends in .parquet" in capsys.readouterr().err
+
+
 def test_the_page_is_one_file_with_drives(rows: list[Path]) -> None:
     page = render([Entered.read(folder) for folder in rows])
     assert page.count("<svg") == 2
