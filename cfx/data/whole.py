@@ -52,10 +52,13 @@ def remarks_on_leaders(tracks: Tracks) -> tuple[Remark, ...]:
     """
     if not len(tracks):
         return ()
-    return tuple(Remark(f"{words}: {_QUESTION}") for words in _signs(tracks))
+    remarks = []
+    for sign in _signs_of_missing_vehicles(tracks):
+        remarks.append(Remark(f"{sign}: {_QUESTION}"))
+    return tuple(remarks)
 
 
-def _signs(tracks: Tracks) -> Iterator[str]:
+def _signs_of_missing_vehicles(tracks: Tracks) -> Iterator[str]:
     """Yields a sentence for each sign that vehicles are missing."""
     ahead, has_leader = rows_ahead(tracks)
     has_follower = np.zeros(len(tracks), dtype=bool)
