@@ -195,8 +195,11 @@ def _constant_in_time(program: StepProgram, varied: Sequence[bool]) -> list[Assi
     constant = set(parameter_names(len(varied)))
     constant_statements = []
     for statement in program.statements:
-        names = [operand for operand in statement.operands if not operand.startswith("real(")]
-        if names and constant.issuperset(names) and not statement.is_condition:
+        names = set()
+        for operand in statement.operands:
+            if not operand.startswith("real("):  # a number, which is constant anyway
+                names.add(operand)
+        if names and names <= constant and not statement.is_condition:
             constant.add(statement.name)
             constant_statements.append(statement)
     return constant_statements
