@@ -310,13 +310,13 @@ def _check_on_the_road(run: ScenarioRun, scenario: Path) -> None:
     for name, tally in run.tallies.items():
         if tally.vehicles:
             continue
-        why = ""
+        reason = ""
         if run.left_out:
             number, first = len(run.left_out), run.left_out[0]
-            why = f". SUMO left out {number} of the scenario's vehicles and flows: {first}"
+            reason = f". SUMO left out {number} of the scenario's vehicles and flows: {first}"
         raise SumoError(
             f"no vehicle of vType '{name}' was ever on the road in {scenario}"
-            f" ({run.steps * run.dt:g} s); give it a flow, or a later --end{why}"
+            f" ({run.steps * run.dt:g} s); give it a flow, or a later --end{reason}"
         )
 
 
@@ -341,19 +341,20 @@ def _crossings_of_sumo(
             sumo.simulationStep()
             observer.look(sumo)
             touching = set()
-            for found in sumo.simulation.getCollisions():
-                driven = fleet.has_type(found.colliderType) or fleet.has_type(found.victimType)
-                if driven and _is_crossing(found):
-                    touching.add((found.collider, found.victim))
-            total += len(touching - before)
+            for reported in sumo.simulation.getCollisions():
+                is_driven = fleet.has_type(reported.colliderType)
+                is_driven |= fleet.has_type(reported.victimType)
+                if is_driven and _is_crossing(reported):
+                    touching.add((reported.collider, reported.victim))
+            total += len(touching - before)  # a collision that lasts for steps counts once
             before = touching
             task.advance()
     return total
 
 
-def _is_crossing(found: Any) -> bool:
+def _is_crossing(reported: Any) -> bool:
     """Says whether a collision that SUMO reports is one of crossing paths."""
-    return "junction" in found.type
+    return "junction" in reported.type
 
 
 def _name(scenario: Path | str) -> str:
@@ -507,9 +508,9 @@ def command_line(
         command += ["--start", "--quit-on-end", "--delay", "100"]
     # SUMO does not look for collisions at junctions unless it is told to.
     switches = ("--no-step-log", "--duration-log.disable", "--no-warnings", _CHECK_JUNCTIONS)
-    given = {option.partition("=")[0] for option in options}
+    set_by_user = {option.partition("=")[0] for option in options}
     for name in switches:
-        if name not in given:
+        if name not in set_by_user:
             command += [name, "true"]
     if step is not None:
         command += ["--step-length", f"{step:g}"]
@@ -520,10 +521,10 @@ def command_line(
 
 def _reason(error: Exception) -> str:
     """Returns SUMO's words on one line; some of them it prints on stderr alone."""
-    said = " ".join(str(error).split()).rstrip(".")
-    if said in {"", "Process Error", "Connection closed by SUMO"}:
+    message = " ".join(str(error).split()).rstrip(".")
+    if message in {"", "Process Error", "Connection closed by SUMO"}:
         return "its own message stands above"
-    return said
+    return message
 
 
 class _Motions(NamedTuple):
@@ -590,17 +591,17 @@ class _Run:
 
     def _check_types(self) -> None:
         """Checks that all vTypes are in the scenario."""
-        known = self._sumo.vehicletype.getIDList()
+        vtypes = self._sumo.vehicletype.getIDList()
         for name in self._fleet.drivers:
-            if name not in known:
-                own = []
-                for one in known:
-                    if not one.startswith("DEFAULT_"):
-                        own.append(one)
+            if name not in vtypes:
+                of_scenario = []
+                for vtype in vtypes:
+                    if not vtype.startswith("DEFAULT_"):  # SUMO's own
+                        of_scenario.append(vtype)
                 raise SumoError(
-                    f"{self._scenario} has no vType '{name}'.{nearest(name, own)} It has:"
-                    f" {', '.join(own) or 'none of its own'}. (A vType must stand ahead of the"
-                    " first vehicle.)"
+                    f"{self._scenario} has no vType '{name}'.{nearest(name, of_scenario)} It has:"
+                    f" {', '.join(of_scenario) or 'none of its own'}. (A vType must stand ahead of"
+                    " the first vehicle.)"
                 )
 
     def _name_members(self) -> None:
@@ -677,9 +678,9 @@ class _Run:
         last = math.inf
         if end is not None:
             last = end
-        given = self._sumo.simulation.getEndTime()
-        if given >= 0:
-            last = min(last, given)
+        end_of_scenario = self._sumo.simulation.getEndTime()
+        if end_of_scenario >= 0:  # -1: the scenario names none
+            last = min(last, end_of_scenario)
         return last
 
     def _after_step(self, dt: float) -> None:
@@ -750,7 +751,7 @@ class _Run:
         for name in names:
             motions.append((vehicle.getSpeed(name), vehicle.getAcceleration(name)))
         speed, acceleration = np.array(motions, dtype=np.float64).T
-        behind = sum(1 for name in names if driver.follows(name))
+        behind = sum(map(driver.follows, names))
         return _Motions(names, speed, acceleration, behind, driver.time_gaps(names).numpy())
 
     def _count_lanes(self, vehicles: Mapping[str, str]) -> None:
