@@ -234,7 +234,7 @@ def _matches(text: Any, expression: str) -> NDArray[np.bool_]:
 
 
 def _marks(column: Any) -> NDArray[np.bool_]:
-    """Returns an Arrow column of truths as an array."""
+    """Returns a column of true and false as an array."""
     return np.asarray(column.to_numpy(zero_copy_only=False), dtype=bool)
 
 
@@ -313,7 +313,7 @@ def parsed(columns: Mapping[str, Floats | Written]) -> dict[str, Floats]:
 
 @contextmanager
 def in_column(name: str) -> Iterator[None]:
-    """Names the column of what is found to be unreadable."""
+    """Adds the column's name to an `Unreadable` that the block raises."""
     try:
         yield
     except Unreadable as error:
@@ -322,7 +322,7 @@ def in_column(name: str) -> Iterator[None]:
 
 
 def _stored(column: Any) -> Any:
-    """Returns a column without what only says how it is stored."""
+    """Returns a column's values: dictionaries, run lengths and extension types are resolved."""
     kind = column.type
     if isinstance(kind, pa.BaseExtensionType):
         storage = kind.storage_type
@@ -478,7 +478,10 @@ def names_in(column: Any) -> NameColumn:
 
 
 def _encoded(column: Any) -> tuple[Ints, list[Any]]:
-    """Returns what each cell holds, and where each row's is, `(N,)`; the last stands for none."""
+    """Returns the different cells, and for each row the number of its cell, `(N,)`.
+
+    An empty cell has the number after the last.
+    """
     if not pa.types.is_dictionary(column.type):
         is_uuid = getattr(column.type, "extension_name", "") == "arrow.uuid"
         if is_uuid:

@@ -373,7 +373,7 @@ def _improvements(
 
 
 def _about(tested: ComparedPairs, measures: _Measures, names: Sequence[str]) -> pd.DataFrame:
-    """Returns `Evaluation.about`."""
+    """Returns a row per pair and method: who drives, the cluster and the mean parameters."""
     pairs = tested.pairs
     by_driver = tested.style.table.set_index("driver")
     methods = list(measures.parameters)

@@ -81,7 +81,7 @@ def _row(
     about: pd.DataFrame,
     errors: Mapping[str, pd.DataFrame],
 ) -> dict[str, object]:
-    """Returns the row of some pairs of a site, of which `about` has the labels.
+    """Returns the row of some pairs of a site; `about` has their sites, drivers and types.
 
     The first of `errors` is the one by which the job is judged.
     """

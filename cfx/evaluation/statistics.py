@@ -167,7 +167,7 @@ def mean_interval(values: Sequence[float], drivers: Sequence[str]) -> tuple[floa
 
 
 def _numbered(drivers: Sequence[str] | None, counts: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Returns the number of the driver of each pair that counts."""
+    """Numbers the drivers of the pairs that count, and returns each pair's number."""
     if drivers is None:
         return np.arange(int(counts.sum()))
     return np.unique(np.asarray(drivers)[counts], return_inverse=True)[1]

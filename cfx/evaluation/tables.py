@@ -70,7 +70,7 @@ def long_table(
 
 
 def _categories(codes: NDArray[Any], names: list[str]) -> Any:
-    """Returns a column of names, each a number in memory."""
+    """Returns a column of names; memory holds a small number for each."""
     return pd.Categorical.from_codes(codes, pd.Index(names))
 
 

@@ -170,7 +170,7 @@ def ring_waves(position: Tensor, speed: Tensor, circumference: float, interval: 
 
 
 def _peak(values: Tensor, place: Tensor) -> Tensor:
-    """Returns how far from a place `(P,)` a parabola through three values `(P, n)` has its top."""
+    """Returns how far from a place `(P,)` a parabola through it and its neighbours has its top."""
     rows = torch.arange(len(place), device=place.device)
     before, here, after = (values[rows, place + k] for k in (-1, 0, 1))
     curvature = before - 2.0 * here + after

@@ -75,7 +75,7 @@ class TrainingPairs:
 
     @property
     def known_drivers(self) -> tuple[str, ...]:
-        """Whose pair each is; each is another driver's where none is named."""
+        """The driver of each pair; where none is named, each pair is a driver of its own."""
         return self.drivers or tuple(str(number) for number in range(len(self)))
 
 

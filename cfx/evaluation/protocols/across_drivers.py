@@ -232,7 +232,7 @@ class AcrossDrivers(Protocol):
         pooled: Tensor,
         labels: WindowLabels | None,
     ) -> _Calibrated:
-        """Returns what was calibrated, with what policies start from."""
+        """Returns the calibrated parameters, and those from which the policies' answers start."""
         s = self.settings
         start = pooled
         if s.base == "default":

@@ -158,7 +158,7 @@ class FinishedPolicy:
             )
 
     def _named_alike(self, pairs: PairSet) -> int:
-        """Counts drivers here who have the name of one that the policy learned from."""
+        """Counts the drivers that have the same name as one that the policy learned from."""
         return len(set(pairs.drivers) & set(self.agent.trained_on.pairs.values()))
 
 

@@ -124,7 +124,7 @@ def _too_few(
 
 
 def _groups(pairs: PairSet, together: Together) -> Sequence[Any]:
-    """Returns what each pair's fold is chosen for."""
+    """Returns the group of each pair (its driver, platoon, ...); a fold has whole groups."""
     if together == "platoon":
         return _platoons(pairs)
     if together == "vehicle":

@@ -591,7 +591,7 @@ def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
 
 
 def _shards_of_pairs(pairs: int) -> Iterator[slice]:
-    """Yields which pairs are read at once."""
+    """Yields the rows of pairs that are read together, so that their windows fit into memory."""
     for first in range(0, pairs, _PAIRS_AT_ONCE):
         yield slice(first, min(first + _PAIRS_AT_ONCE, pairs))
 
@@ -644,7 +644,7 @@ def _known_as(
     time_gap: Tensor,
     in_queue: Tensor,
 ) -> Tensor:
-    """Chooses whose driver features each place's driver has, `(N, B)`, of the U pairs.
+    """Chooses which of the U pairs each place's driver has the driver features of, `(N, B)`.
 
     A simulated driver who leaves a queue stands for a recorded one of the same network, who was
     never seen at a light: the driver whose time gap has the same rank among recorded drivers. So

@@ -106,7 +106,7 @@ def remembered(key: str | None, make: Callable[[], str]) -> str:
 
 @functools.cache
 def _tell() -> None:
-    """Says once what takes a while the first time."""
+    """Logs, once in a process, that code is compiled, which takes seconds the first time."""
     log.info("Compiling for this processor; what is compiled is kept in %s", cache_folder())
 
 

@@ -761,13 +761,13 @@ class _Run:
             return
         self._lanes_next = now + _LANES_EVERY_S
         names = list(vehicles)
-        lanes, before = dict(zip(names, lanes_of(self._sumo, names), strict=True)), self._lanes
+        lanes = dict(zip(names, lanes_of(self._sumo, names), strict=True))
         for name, lane in lanes.items():
-            last = before.get(name, lane)
-            if lane == last:
+            last_lane = self._lanes.get(name, lane)
+            if lane == last_lane:
                 continue
-            edge, _, index = lane.rpartition("_")
-            last_edge, _, last_index = last.rpartition("_")
+            edge, _, index = lane.rpartition("_")  # SUMO calls lanes EDGE_INDEX
+            last_edge, _, last_index = last_lane.rpartition("_")
             if edge and edge == last_edge:
                 self._tallies[vehicles[name]].lane_changes += abs(int(index) - int(last_index))
         self._lanes = lanes
@@ -783,21 +783,21 @@ class _Run:
         """Notes the collisions that SUMO reports after a step; one that goes on is one."""
         now = self._sumo.simulation.getTime()
         touching = {}
-        for found in self._sumo.simulation.getCollisions():
-            kind = self._type_of.get(found.collider) or self._type_of.get(found.victim)
+        for reported in self._sumo.simulation.getCollisions():
+            kind = self._type_of.get(reported.collider) or self._type_of.get(reported.victim)
             if kind is None:
                 continue
-            key = found.collider, found.victim
-            known, before = self._touching.get(key), self._gap_before(*key)
-            if known is None:
-                gap = self._gap(found, before, dt)
-                crossing = _is_crossing(found)
-                known = Collision(now, kind, *key, found.lane, found.pos, gap, crossing)
-                self._collisions.append(known)
-            elif known.gap is not None and before is not None:
+            key = reported.collider, reported.victim
+            collision, gap_before = self._touching.get(key), self._gap_before(*key)
+            if collision is None:
+                gap = self._gap(reported, gap_before, dt)
+                crossing = _is_crossing(reported)
+                collision = Collision(now, kind, *key, reported.lane, reported.pos, gap, crossing)
+                self._collisions.append(collision)
+            elif collision.gap is not None and gap_before is not None:
                 # SUMO goes on to report the speeds of the first step.
-                known.gap = min(known.gap, before)
-            touching[key] = known
+                collision.gap = min(collision.gap, gap_before)
+            touching[key] = collision
         self._touching = touching
 
     def _gap_before(self, collider: str, victim: str) -> float | None:
@@ -806,22 +806,22 @@ class _Run:
             return None
         return self._fleet.driver(collider).gap_to(collider, victim)
 
-    def _gap(self, found: Any, before: float | None, dt: float) -> float | None:
+    def _gap(self, reported: Any, gap_before: float | None, dt: float) -> float | None:
         """Returns the gap as a collision begins, bumper to bumper, m.
 
         SUMO may have taken the vehicles off the road by now. So it is the gap of the step before,
         and what their speeds have made of it; for a vehicle that has just changed lanes, or that no
         policy drives, the places of both on the lane.
         """
-        if found.type != "collision":
+        if reported.type != "collision":
             return None  # their paths cross, or they meet head-on
-        if before is not None:
-            return float(before + (found.victimSpeed - found.colliderSpeed) * dt)
-        vehicle = self._sumo.vehicle
-        if found.victim not in vehicle.getIDList() or vehicle.getLaneID(found.victim) != found.lane:
+        if gap_before is not None:
+            return float(gap_before + (reported.victimSpeed - reported.colliderSpeed) * dt)
+        vehicle, victim = self._sumo.vehicle, reported.victim
+        if victim not in vehicle.getIDList() or vehicle.getLaneID(victim) != reported.lane:
             return None
-        back = vehicle.getLanePosition(found.victim) - vehicle.getLength(found.victim)
-        return float(back - found.pos)
+        rear = vehicle.getLanePosition(victim) - vehicle.getLength(victim)
+        return float(rear - reported.pos)
 
     def _count_teleports(self) -> None:
         for name in self._sumo.simulation.getStartingTeleportIDList():
@@ -887,18 +887,18 @@ class _Rows:
         return row
 
 
-def parse_drivers(given: Sequence[str]) -> dict[str, str]:
+def parse_drivers(arguments: Sequence[str]) -> dict[str, str]:
     """Reads `TYPE=RUN` arguments.
 
     Raises:
         ConfigError: one is not of this form, or names a vType twice.
     """
     runs: dict[str, str] = {}
-    for one in given:
-        name, equals, run = one.partition("=")
+    for argument in arguments:
+        name, equals, run = argument.partition("=")
         if not (name and equals and run):
             raise ConfigError(
-                f"--drivers {one}: write TYPE=RUN, a vType of the scenario and a job's output"
+                f"--drivers {argument}: write TYPE=RUN, a vType of the scenario and a job's output"
                 " folder"
             )
         if name in runs:
