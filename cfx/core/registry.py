@@ -471,7 +471,7 @@ def _installed(
     kind: str,
     search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - part of the cache's key
 ) -> tuple[Installed[Any], ...]:
-    made = []
+    components = []
     for announced in entries(kind):
         others = rivals(announced)
         if others:
@@ -484,8 +484,8 @@ def _installed(
                 raise
             _warn_of_left_out(announced, str(error))
             continue
-        made.append(Installed(kind, announced.name, component, announced.distribution))
-    return tuple(sorted(made, key=lambda one: (one.component.order, one.name)))
+        components.append(Installed(kind, announced.name, component, announced.distribution))
+    return tuple(sorted(components, key=lambda one: (one.component.order, one.name)))
 
 
 def _warn_of_left_out(component: Entry | Installed[Any], reason: str) -> None:

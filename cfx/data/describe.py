@@ -386,19 +386,19 @@ _WRITTEN_UNITS = {
 
 def _own_columns(path: Path, columns: Sequence[str]) -> str:
     """Returns what to write for a table whose columns have names of their own."""
-    taken: dict[str, str] = {}
+    column_of: dict[str, str] = {}
     units = []
     for quantity, expression in _QUANTITIES.items():
         for name in columns:
-            if name not in taken.values() and re.search(expression, name.lower()):
-                taken[quantity] = name
+            if name not in column_of.values() and re.search(expression, name.lower()):
+                column_of[quantity] = name
                 break
-        unit = _unit_in(taken.get(quantity, ""), quantity)
+        unit = _unit_in(column_of.get(quantity, ""), quantity)
         if unit:
             units.append((quantity, unit))
     words = []
     for quantity in _QUANTITIES:
-        words.append(f"data.columns.{quantity}={shlex.quote(taken.get(quantity, 'COLUMN'))}")
+        words.append(f"data.columns.{quantity}={shlex.quote(column_of.get(quantity, 'COLUMN'))}")
     for quantity, unit in units:
         words.append(f"data.units.{quantity}={unit}")
     return (
@@ -472,7 +472,7 @@ def _advice(pairs: Sequence[tuple[int, float]], usual: float) -> tuple[str, list
 
 
 def _without_length(pairs: PairSet) -> list[str]:
-    """Returns what follows from leaders whose length is not known."""
+    """Returns a sentence on leaders whose length is not known; nothing where all are."""
     unknown = len(pairs) - len(_with_length(pairs))
     if not unknown:
         return []

@@ -84,7 +84,7 @@ class _Rule:
     max_typical_left_over: float = math.inf
 
     def breaks_slope(self, agreement: Agreement) -> bool:
-        """Says whether a slope is out of its bounds; no if it says nothing."""
+        """Says whether a slope is out of its bounds; False where the signals vary too little."""
         if agreement.spread < self.spread or agreement.unexplained > 0.95:
             return False
         if agreement.slope <= 0:
@@ -174,7 +174,7 @@ class Agreement:
 
     @property
     def unexplained(self) -> float:
-        """The part of the one's standard deviation that the other does not explain, 0 to 1."""
+        """Share of the signal's standard deviation that the integral does not explain, 0 to 1."""
         return math.sqrt(max(0.0, 1.0 - self.correlation**2))
 
 
@@ -294,7 +294,7 @@ class Contradiction:
     other_slope: float | None = None
 
     def text(self, units: Units | None = None) -> str:
-        """Returns what contradicts what, and why probably.
+        """Returns which signals contradict each other, and the probable reason.
 
         Args:
             units: those that the file is said to have in place of SI units.
@@ -304,7 +304,7 @@ class Contradiction:
         return f"{self.signals}: {self._reason(self.slope, units or {})}"
 
     def _reason(self, slope: float, units: Units) -> str:
-        """Returns what a slope says, and of which unit, sign or time step it is."""
+        """Returns what a slope says, and which unit, sign or time step would explain it."""
         step = f"the time step looks like {slope * self.dt:.3g} s, not {self.dt:.3g} s"
         other = self.other_slope
         read_in = _units_of(self.signals.partition("_")[0], units)
@@ -397,7 +397,7 @@ def _gap_relation(pair: Pair) -> _Relation:
 
 
 def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | None:
-    """Returns what of a pair contradicts what; None if nothing does.
+    """Returns the first contradiction between signals of a pair; None if there is none.
 
     Args:
         units: those that its file is said to have; its signals are in SI units.
@@ -420,7 +420,7 @@ def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | Non
 def _contradiction_in(
     relation: _Relation, of_neighbour: _Relation, of_other_signal: Agreement
 ) -> Contradiction | None:
-    """Returns that a signal is not what its rate says; None if it is.
+    """Compares a signal with its rate; None if it changes as the rate says.
 
     Args:
         relation: the signal and its rate.
@@ -492,7 +492,7 @@ def _reason_left_over(relation: _Relation, of_neighbour: _Relation | None, left_
 
 
 def _leap(relation: _Relation) -> Contradiction | None:
-    """Returns the first of a few steps that no vehicle makes; of many, a unit is wrong."""
+    """Finds the first of a few steps that no vehicle makes; many mean a wrong unit."""
     pair, moved = relation.pair, np.diff(relation.values)
     most, rate = _LEAP_MPS + _LEAP_MPS2 * pair.dt, _MOST_MPS2
     if relation.quantity == "position":
@@ -514,7 +514,7 @@ def _leap(relation: _Relation) -> Contradiction | None:
 
 
 def _constant(relation: _Relation) -> Contradiction | None:
-    """Returns that one signal is the same in all frames although the other says otherwise."""
+    """Finds a signal that is the same in all frames although the other one says otherwise."""
     signal, rate = relation.signals.split(" and ")
     has_constant_values = bool((relation.values == relation.values[0]).all())
     has_constant_rates = bool((relation.rates == relation.rates[0]).all())
@@ -532,7 +532,7 @@ def _constant(relation: _Relation) -> Contradiction | None:
 
 
 def _by_gap(problem: Contradiction, pair: Pair, units: Units) -> Contradiction:
-    """Returns a contradiction in the words of a file that has gaps in place of positions."""
+    """Explains a contradiction where a file has gaps: its positions were made from them."""
     read_in = _units_of("follower", units)
     if problem.quantity == "speed" or not follows_from_gaps(pair):
         return problem
@@ -593,7 +593,7 @@ def _units_of(who: str, units: Units) -> dict[str, str]:
 def _factors(
     read_in: Units, faster: Sequence[str] = (), slower: Sequence[str] = ()
 ) -> dict[float, str]:
-    """Returns what slopes say of units: the slope, and the unit that a quantity seems to have.
+    """Returns what each slope would mean: a quantity that is in another unit than it is read in.
 
     Args:
         read_in: the unit in which each quantity was read.
@@ -628,7 +628,7 @@ def contradictions(
 
 
 def typical_contradiction(pairs: PairSet) -> Contradiction | None:
-    """Returns what contradicts what over all pairs together; None if nothing does.
+    """Returns a contradiction that only all pairs together show; None if there is none.
 
     Pairs in time steps of their own are compared too: a slope has no unit.
     """

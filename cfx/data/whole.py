@@ -45,7 +45,7 @@ _QUESTION = (
 
 
 def remarks_on_leaders(tracks: Tracks) -> tuple[Remark, ...]:
-    """Returns what speaks against leaders that are the next vehicles in the lane.
+    """Returns signs that leaders, found as the next vehicle in the lane, are not the true ones.
 
     Args:
         tracks: rows whose leaders were found by place.

@@ -172,12 +172,12 @@ class Measure(NamedTuple):
     def of(cls, name: str, value: float, step: float) -> Measure:
         """Returns a measure that `USUAL` has."""
         usual = USUAL[name]
-        word = ""
+        verdict = ""
         if value < usual.low:
-            word = usual.below
+            verdict = usual.below
         elif value > usual.high:
-            word = usual.above
-        return cls(name, value, step, usual.low, usual.high, word)
+            verdict = usual.above
+        return cls(name, value, step, usual.low, usual.high, verdict)
 
     @classmethod
     def of_flow(cls, speed: float, flows: Floats, recorded: float, step: float) -> Measure:
@@ -277,8 +277,8 @@ class RecordedFlows(NamedTuple):
         """Returns quantiles of drivers' time gaps as `DriverTraffic.time_gaps` has them."""
         speeds, columns = np.array(FLEET_SPEEDS_MPS), []
         for gap in (self.relation.low, self.relation.median, self.relation.high):
-            there = np.interp(speeds, self.relation.speed, gap, left=np.nan, right=np.nan)
-            columns.append(there / speeds)
+            gaps = np.interp(speeds, self.relation.speed, gap, left=np.nan, right=np.nan)
+            columns.append(gaps / speeds)
         return np.stack(columns, -1)
 
 
@@ -341,8 +341,8 @@ def driver_traffic(
     usual = np.full(len(SPEEDS_MPS), np.nan)
     if recorded is not None:
         usual = recorded.at(np.array(SPEEDS_MPS))
-    for speed, of_speed, there in zip(SPEEDS_MPS, flows, usual, strict=True):
-        measures.append(Measure.of_flow(speed, of_speed, float(there), step))
+    for speed, of_speed, usual_flow in zip(SPEEDS_MPS, flows, usual, strict=True):
+        measures.append(Measure.of_flow(speed, of_speed, float(usual_flow), step))
     differ = float(100.0 * (flows.max(1) / flows.min(1) - 1.0).max())
     measures.append(Measure.of("starts_differ", differ, step))
     measures.append(Measure.of("capacity", float(ring[:, 1].max()), step))
