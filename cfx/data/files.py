@@ -89,6 +89,7 @@ _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 """Bytes below 32 that no text has: all but tab, line feed, form feed and carriage return."""
 
 _TAR_AT, _TAR = 257, b"ustar"
+"""Where a tar archive says that it is one (POSIX.1-1988): behind the fields of its first file."""
 
 _HEAD = 1 << 16
 """Bytes that are looked at before a file is read."""

@@ -38,6 +38,8 @@ from cfx.data.tracks import beyond_rates, follows_from_gaps
 from cfx.data.units import factor
 
 _WINDOW_S = 5.0
+"""Length of the windows over which changes are compared, s: longer than noise, and so short that
+a small bias of a speed does not add up."""
 
 _WINDOWS = 200
 """Windows of a pair that are looked at, at least, where it has as many; they overlap."""

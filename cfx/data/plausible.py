@@ -30,6 +30,7 @@ _MANY = 4
 """Pairs that say what is typical."""
 
 _FROZEN_S = 1.0
+"""A signal that stays the same for this long while its rate says otherwise is frozen, s."""
 
 
 def doubts(pairs: PairSet) -> Iterator[str]:

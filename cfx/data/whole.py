@@ -29,6 +29,7 @@ _DESIRED = 0.9
 """Quantile of a vehicle's speeds in a lane that counts as its desired speed there."""
 
 _ACCELERATES_MPS2 = 0.1
+"""A driver whose mean acceleration over a second is smaller does not accelerate."""
 
 _HELD_UP = 0.25
 """Share of the moments at which slow drivers far behind a leader do not accelerate. It is 0 to 0.13

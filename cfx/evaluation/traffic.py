@@ -94,7 +94,10 @@ _DIP_FROM_MPS, _DIP_MPS2, _DIP_S = 15.0, 1.0, 5.0
 """Speed before the dip, how hard the leader changes speed, how long it stays slow."""
 
 _DIP_BEGINS_S, _DIP_LASTS_S = 300.0, 200.0
+"""How long the platoon settles before the dip, and how long vehicles are watched from then on."""
+
 _AVERAGED_S = 10.0
+"""Over so long speeds and gaps of settled vehicles are averaged, s."""
 
 _SUGIYAMA, _SUGIYAMA_M, _SUGIYAMA_S = 22, 230.0, 600.0
 _PERTURBATION = 0.1

@@ -47,6 +47,7 @@ _VECTOR_MATH = ("-DVECTOR_MATH", "-lmvec", "-lm", "-Wl,-z,defs")
 place; tried first. Where it has none of them, linking fails, and they are computed one by one."""
 
 _TIMEOUT_S = 120
+"""A compiler that takes longer hangs, s."""
 
 
 @functools.cache
