@@ -95,8 +95,10 @@ def nearest(name: str, choices: Iterable[str]) -> str:
 
 def first_line(error: BaseException) -> str:
     """Returns the first line of an error's text; its type's name where it has none."""
-    lines = (line.strip() for line in str(error).splitlines())
-    return next((line for line in lines if line), type(error).__name__)
+    text = str(error).strip()
+    if not text:
+        return type(error).__name__
+    return text.splitlines()[0].strip()
 
 
 _OF_MANY = re.compile(

@@ -103,13 +103,14 @@ class CarFollowingRegressor(RegressorMixin, BaseEstimator):  # type: ignore[misc
         check_is_fitted(self)
         table = frame_of_any(X, "X")
         # A prediction calibrates nothing, so settings such as the optimizer's have no place here.
-        settings = self.settings or {}
-        keys = [key for key in settings if key.startswith(("model.", "data."))]
-        of_model = {key: settings[key] for key in keys}
-        drive = simulate(self.model, self.parameters_, _pairs(table), **of_model)
+        settings = dict(self.settings or {})
+        for key in self.settings or {}:
+            if not key.startswith(("model.", "data.")):
+                del settings[key]
+        trajectories = simulate(self.model, self.parameters_, _pairs(table), **settings)
         order = row_order(table)
         speed = np.empty(len(order))
-        speed[order] = drive["speed"]
+        speed[order] = trajectories["speed"]
         return speed
 
     def score(self, X: Any, y: object = None) -> float:  # noqa: N803 - as above

@@ -503,10 +503,10 @@ def compare(*jobs: Fit | Result, **named: Fit | Result) -> Comparison:
     results: dict[str, Result] = {}
     for job in jobs:
         result = job.result if isinstance(job, Fit) else job
-        parts = [result.component("model")]
+        name = result.component("model")
         if isinstance(job, Result):
-            parts.append(result.component("policy"))
-        name = " ".join(part for part in parts if part) or f"job {len(results) + 1}"
+            name = f"{name} {result.component('policy')}".strip()
+        name = name or f"job {len(results) + 1}"
         while name in results:
             name += "'"
         results[name] = result

@@ -131,7 +131,7 @@ class Pairs:
         chosen_ids = chosen_names(pair_ids, available, self.selected.source)
         keep = [name in chosen_ids for name in available]
         chosen = self.selected.select(keep, "not selected")
-        node = {**self.node, "pair_ids": [pair.pair_id for pair in chosen]}
+        node = {**self.node, "pair_ids": chosen.ids}
         return replace(self, selected=chosen, node=node)
 
     def save(self, path: str | Path) -> Pairs:
@@ -229,9 +229,10 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
     if frame is not None:
         overrides["data.path"] = IN_MEMORY
         node = config_of({"data": dataset or "tidy", **overrides}).data
-        values = {key: value for key, value in node.items() if key != "name"}
-        made = validate(TidySettings, values, where="data")
-        return Pairs(FrameDataset(made, frame).load(), node)
+        values = dict(node)
+        del values["name"]
+        reader_settings = validate(TidySettings, values, where="data")
+        return Pairs(FrameDataset(reader_settings, frame).load(), node)
     paths = []
     for path in [source] if isinstance(source, str | Path) else _paths(source):
         if is_url(str(path)):
@@ -276,7 +277,10 @@ def pairs_from(source: PairsLike, settings: Mapping[str, Any] | None = None) -> 
     Raises:
         ConfigError: the pairs have been read already, so that a setting of `data` does nothing.
     """
-    of_data = {key: value for key, value in (settings or {}).items() if _is_of_data(key)}
+    settings = settings or {}
+    of_data = dict(settings)
+    for key in without_data(settings):
+        del of_data[key]
     if isinstance(source, Pairs | PairSet):
         if of_data:
             key, value = next(iter(of_data.items()))

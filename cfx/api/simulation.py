@@ -247,8 +247,8 @@ def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict
                 f"parameters: two rows are of pair '{twice}'; give one row for each pair"
             )
         table = parameters.set_axis(names)
-        missing = [name for name in ids if name not in table.index]
-        if missing:
+        missing = pd.Index(ids)[~pd.Index(ids).isin(table.index)]
+        if len(missing):
             raise ConfigError(
                 f"parameters: there is no row for pair '{missing[0]}' ({len(missing)} such pairs);"
                 " give a row for each, or one set for all"

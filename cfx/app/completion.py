@@ -31,23 +31,26 @@ def answer(arguments: Sequence[str]) -> int:
     line = line[: int(os.environ.get("COMP_POINT", len(line)))]
     _, _, typed = line.lstrip().partition(" ")
     typed = typed.lstrip()
-    first, blank, rest = typed.partition(" ")
+    command, is_complete, arguments_typed = typed.partition(" ")
     commands = registry.names("command")
-    if blank and first in commands:
-        action, more, behind = rest.partition(" ")
-        if more and f"{first}.{action}" in commands:
-            print("\n".join(_words_of(f"{first}.{action}", behind)))
+    if is_complete and command in commands:
+        action, is_action_complete, typed_of_action = arguments_typed.partition(" ")
+        if is_action_complete and f"{command}.{action}" in commands:
+            print("\n".join(_words_of(f"{command}.{action}", typed_of_action)))
             return 0
-        words = _words_of(first, rest)
+        words = _words_of(command, arguments_typed)
         for name in commands:
-            if not more and name.startswith(f"{first}.{action}"):
-                words.append(name.removeprefix(f"{first}."))
+            if not is_action_complete and name.startswith(f"{command}.{action}"):
+                words.append(name.removeprefix(f"{command}."))
         print("\n".join(words))
         return 0
-    if not blank:
-        roots = [name for name in commands if name.startswith(first) and "." not in name]
-        print("\n".join(roots))
-        if roots and first:
+    if not is_complete:
+        matching = []
+        for name in commands:
+            if name.startswith(command) and "." not in name:
+                matching.append(name)
+        print("\n".join(matching))
+        if matching and command:
             return 0
     from cfx.app import application  # takes ten times as long as all of the above
 

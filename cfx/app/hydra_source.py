@@ -103,13 +103,14 @@ class ComponentSearchPath(SearchPathPlugin):
     """Appends each plugin's `conf/` and then `cfx://` to Hydra's search path."""
 
     def manipulate_search_path(self, search_path: ConfigSearchPath) -> None:
-        # A file of such a name on the search path would replace Hydra's own.
-        in_code = {f"hydra/{name}.yaml" for name in ("config", "launcher/basic", "sweeper/basic")}
+        # A file of such a name on the search path would replace Hydra's own. Hydra has most of them
+        # in its folder `conf`; three are defined in its code.
+        in_code = {"hydra/config.yaml", "hydra/launcher/basic.yaml", "hydra/sweeper/basic.yaml"}
         of_hydra = Path(hydra.__file__).parent / "conf"
         for package, folder in plugin_conf_dirs().items():
-            names = {path.relative_to(folder).as_posix() for path in folder.rglob("*.yaml")}
             replaced = []
-            for name in sorted(names):
+            for path in sorted(folder.rglob("*.yaml")):
+                name = path.relative_to(folder).as_posix()
                 if name in in_code or (of_hydra / name).is_file():
                     replaced.append(name)
             if replaced:
@@ -223,28 +224,31 @@ def _for_this_thread(singleton: type, attribute: str, value: Any) -> Iterator[No
     instances: dict[Any, Any] = Singleton._instances  # noqa: SLF001 - Hydra has no way to replace one
     thread = threading.get_ident()
     with _HYDRA:
-        before = instances.get(singleton)
-        usual = before
-        if usual is None:
-            usual = object.__new__(singleton)
-            usual.__init__()
-        unused = dict(vars(usual))
+        earlier = instances.get(singleton)
+        shared = earlier
+        if shared is None:
+            shared = object.__new__(singleton)
+            shared.__init__()
+        initial = dict(vars(shared))
 
         def read(_: Any) -> Any:
-            return value if threading.get_ident() == thread else getattr(usual, attribute)
+            return value if threading.get_ident() == thread else getattr(shared, attribute)
 
         def write(_: Any, changed: Any) -> None:
-            setattr(usual, attribute, changed)
+            setattr(shared, attribute, changed)
 
-        here = type(singleton.__name__, (singleton,), {attribute: property(read, write)})
-        mine: Any = object.__new__(here)
-        instances[singleton] = mine
+        # The attribute must be a property, which only a class can have: so the replacement is of a
+        # subclass, and `isinstance` holds for it.
+        of_thread = type(singleton.__name__, (singleton,), {attribute: property(read, write)})
+        replacement: Any = object.__new__(of_thread)
+        instances[singleton] = replacement
         try:
             yield
         finally:
-            if instances.get(singleton) is mine:
-                instances[singleton] = usual
-                if before is None and vars(usual) == unused:
+            if instances.get(singleton) is replacement:
+                instances[singleton] = shared
+                # Where there was none, and no other thread has used it, there is none again.
+                if earlier is None and vars(shared) == initial:
                     del instances[singleton]
 
 
@@ -254,7 +258,11 @@ def plain(config: DictConfig) -> dict[str, Any]:
     Raises:
         OmegaConfBaseException: an interpolation leads nowhere.
     """
-    job = OmegaConf.masked_copy(config, [str(key) for key in config if key != "hydra"])
+    groups = []
+    for key in config:
+        if key != "hydra":
+            groups.append(str(key))
+    job = OmegaConf.masked_copy(config, groups)
     with resolving(config):
         return cast("dict[str, Any]", OmegaConf.to_container(job, resolve=True))
 

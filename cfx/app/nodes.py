@@ -127,9 +127,10 @@ def write_distributions() -> None:
 
 def distributions_text(root: Path) -> str:
     """Returns the text of `distributions.json` for the checkout in `root`."""
-    kinds = [kind for kind in registry.KINDS.values() if kind.name != "metric"]
-    kinds += [registry.SIMPLE_KINDS[name] for name in ("export", "figure", "posterior", "tracker")]
-    groups = {kind.entry_points: kind.group for kind in kinds}
+    groups = {}
+    for kind in (*registry.KINDS.values(), *registry.SIMPLE_KINDS.values()):
+        if kind.name not in {"metric", "head"}:
+            groups[kind.entry_points] = kind.group
     return json.dumps(options_of_checkout(root, groups), indent=1) + "\n"
 
 
@@ -146,10 +147,9 @@ def _settings(schema: type[BaseModel], values: Mapping[str, Any]) -> list[str]:
         if field.is_required():
             note = f"required: {note}".strip()
         if isinstance(value, BaseModel):
-            nested = {key: getattr(value, key) for key in type(value).model_fields}
             lines += _comment(note)
             lines.append(f"{_scalar(name)}:")
-            lines += _indented(_settings(type(value), nested))
+            lines += _indented(_settings(type(value), dict(value)))
         else:
             lines += _line(name, _value(to_jsonable_python(value)), note)
     return lines
@@ -197,7 +197,7 @@ def _line(name: str, value: str, note: str) -> list[str]:
 def _comment(text: str) -> list[str]:
     lines = []
     for paragraph in text.splitlines():
-        lines += [f"# {part}" for part in textwrap.wrap(paragraph, _WIDTH - 2)]
+        lines += textwrap.wrap(paragraph, _WIDTH, initial_indent="# ", subsequent_indent="# ")
     return lines
 
 

@@ -118,33 +118,28 @@ def _unreadable(error: OverrideParseException) -> str:
 
 def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     """Returns a sentence with the keys that there are where `key` was looked for."""
-    typed, of_key = key, re.compile(rf"\+*{re.escape(key)}\b")
+    typed = _override_of(key, overrides)
+    right = []  # as far as is known; composed alone, they say which keys there are
     for override in overrides:
-        if of_key.match(override):
-            typed = override
-            break
-    others = [override for override in overrides if override != typed]
+        if override != typed:
+            right.append(override)
     try:
-        config: Any = hydra_source.composed(others)
+        config: Any = hydra_source.composed(right)
     except Exception:  # the other overrides may be wrong too; the sentence is then without advice
         return f"{typed}: there is no key '{key}'; cfx --cfg job prints every key"
     node = OmegaConf.select(config, key)
-    if isinstance(node, DictConfig):  # a name in the override's mapping may be wrong
-        value = OverridesParser.create().parse_override(typed).value()
-        names = [str(name) for name in value] if isinstance(value, dict) else []
-        unknown = [name for name in names if name not in node]
-        if unknown:
-            sentence = _unknown_key(f"{key}.{unknown[0]}", others)
-            if len(unknown) == len(names) and "Did you mean" not in sentence:
-                value = typed.partition("=")[2]
-                sentence += f" To replace all of them: '~{key}' '+{key}={value}'"
+    if isinstance(node, DictConfig):
+        sentence = _unknown_name(key, typed, node, right)
+        if sentence:
             return sentence
     parent, _, last = key.rpartition(".")
     siblings = config
     if parent:
         siblings = OmegaConf.select(config, parent)
     if isinstance(siblings, DictConfig):
-        names = sorted(str(name) for name in siblings if name != "hydra")
+        names = sorted(map(str, siblings))
+        if "hydra" in names:  # Hydra's own node, beside those of the job
+            names.remove("hydra")
         advice = nearest(last, names)
         heading = "Known keys"
         if parent:
@@ -157,6 +152,40 @@ def _unknown_key(key: str, overrides: Sequence[str]) -> str:
     everything: Any = OmegaConf.to_container(config, resolve=False)
     paths = _keys(everything)
     return f"{typed}: there is no key '{key}'.{nearest(key, paths)} cfx --cfg job prints every key."
+
+
+def _override_of(key: str, overrides: Sequence[str]) -> str:
+    """Returns the override that sets a key; the key alone if none does."""
+    of_key = re.compile(rf"\+*{re.escape(key)}\b")
+    for override in overrides:
+        if of_key.match(override):
+            return override
+    return key
+
+
+def _unknown_name(key: str, typed: str, node: DictConfig, right: Sequence[str]) -> str:
+    """Returns a sentence for a wrong name in the mapping that an override sets; "" for none.
+
+    Args:
+        key: of the override, `model.parameters` in `model.parameters={taw: 1}`.
+        typed: the override.
+        node: what there is at the key without this override.
+        right: the other overrides.
+    """
+    mapping = OverridesParser.create().parse_override(typed).value()
+    if not isinstance(mapping, dict):
+        return ""
+    unknown = []
+    for name in map(str, mapping):
+        if name not in node:
+            unknown.append(name)
+    if not unknown:
+        return ""
+    sentence = _unknown_key(f"{key}.{unknown[0]}", right)
+    if len(unknown) == len(mapping) and "Did you mean" not in sentence:
+        _, _, value = typed.partition("=")
+        sentence += f" To replace all of them: '~{key}' '+{key}={value}'"
+    return sentence
 
 
 def _options_with(group: str, setting: str, chosen: str) -> str:
@@ -188,8 +217,11 @@ def _plain(error: BaseException) -> str:
     noise = ("object_type=", "See https://", "Config search path", "provider=")
     parts: list[str] = []
     for cause in _chain(error):
-        lines = [line.strip() for line in str(cause).splitlines()]
-        part = " ".join(line for line in lines if line and not line.startswith(noise))
+        lines = []
+        for line in map(str.strip, str(cause).splitlines()):
+            if line and not line.startswith(noise):
+                lines.append(line)
+        part = " ".join(lines)
         if part and part not in parts:
             parts.append(part)
     return ": ".join(parts) or f"{type(error).__name__} while composing the configuration"

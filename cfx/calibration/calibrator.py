@@ -188,9 +188,11 @@ class Calibrator:
         if self.solver.chooses_prior:
             fitted = self._with_prior(self.prior_strength(pairs, batch, last).weight, self.progress)
         parameters, apart = fitted.searched(pairs, batch, last)
+        missed = []
         for pair, end, share in zip(pairs, last.tolist(), apart, strict=True):
             self._apart[pair.fingerprint, end] = share
-        missed = [pair.pair_id for pair, share in zip(pairs, apart, strict=True) if share > APART]
+            if share > APART:
+                missed.append(pair.pair_id)
         if missed:
             named = ", ".join(missed[:_NAMED]) + (" ..." if len(missed) > _NAMED else "")
             log.warning(

@@ -186,7 +186,7 @@ class Solver:
     def _settled(
         self, losses: SegmentLosses | PooledLosses, best: Tensor, default: Tensor
     ) -> Tensor:
-        """Moves the best candidates to where prior plus loss is lowest along each parameter.
+        """Moves the best candidates along each parameter to where loss plus prior is lowest.
 
         A search stops at what it has tried. Where a parameter hardly matters, the prior alone
         says where it belongs, and its slope is too small for a search among steep ones. So each

@@ -42,10 +42,10 @@ def brought() -> Mapping[tuple[str, str], str]:
     It is a distribution, or an extra of one: `cfx-sumo`, `cfx-driving[joblib]`.
     """
     options = {}
-    for wanted, groups in json.loads(FILE.read_text(encoding="utf-8")).items():
+    for distribution, groups in json.loads(FILE.read_text(encoding="utf-8")).items():
         for group, names in groups.items():
             for name in names:
-                options[group, name] = wanted
+                options[group, name] = distribution
     return options
 
 
@@ -74,13 +74,13 @@ def options_of_checkout(root: Path, groups: Mapping[str, str]) -> dict[str, dict
                 options[group] = sorted(set(options.get(group, ())) - set(names))
         table[distribution] = options
     brings = {}
-    for wanted in sorted(table):
+    for owner in sorted(table):
         groups_of_it = {}
-        for group, names in sorted(table[wanted].items()):
+        for group, names in sorted(table[owner].items()):
             if names:
                 groups_of_it[group] = sorted(names)
         if groups_of_it:
-            brings[wanted] = groups_of_it
+            brings[owner] = groups_of_it
     return brings
 
 
@@ -109,8 +109,8 @@ def advice(group: str, name: str, available: Sequence[str]) -> str:
     """
     options = brought()
     if (group, name) in options:
-        wanted = options[group, name]
-        return f" It comes with {wanted}: {install_line(wanted)}"
+        distribution = options[group, name]
+        return f" It comes with {distribution}: {install_line(distribution)}"
     candidates = list(available)
     for option_group, option in options:
         if option_group == group:
@@ -121,18 +121,18 @@ def advice(group: str, name: str, available: Sequence[str]) -> str:
     return text
 
 
-def install_line(wanted: str) -> str:
+def install_line(distribution: str) -> str:
     """Returns the command that installs a distribution, or an extra of cfx's, for this Python.
 
     In a checkout it is the folder's: `pip install --editable plugins/cfx-community`.
     """
-    name, bracket, extra = wanted.partition("[")
+    name, bracket, extra = distribution.partition("[")
     checkout = Path(__file__).resolve().parents[2]
     if name != OWN:
         checkout = checkout / "plugins" / name
-    source = shlex.quote(wanted)
+    source = shlex.quote(distribution)
     if bracket:
-        source = f'"{wanted}"'
+        source = f'"{distribution}"'
     if (checkout / "pyproject.toml").is_file():
         source = f"--editable {shlex.quote(_from_here(checkout) + bracket + extra)}"
     return f"{_pip()} install {source}"

@@ -84,6 +84,7 @@ def in_units(size: float) -> str:
 
 _M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # from glibc's malloc.h
 _TRIM_BYTES, _MMAP_BYTES = 64 << 20, 32 << 20
+"""How much freed memory glibc keeps; larger blocks than the second it asks the system for alone."""
 
 
 @functools.cache

@@ -106,60 +106,58 @@ class Kind:
         return f"{self.group}={component}"
 
 
-KINDS: dict[str, Kind] = {
-    kind.name: kind
-    for kind in (
-        Kind("dataset", "cfx.data.base:Dataset", group="data"),
-        Kind("model", "cfx.models.base:DrivingModel", first="cfx.models.contract:FIRST"),
-        Kind("policy", "cfx.policies.base:Policy", first="cfx.policies.contract:FIRST"),
-        Kind(
-            "optimizer",
-            "cfx.calibration.optimizers:Optimizer",
-            first="cfx.calibration.contract:FIRST_OF_OPTIMIZERS",
-        ),
-        Kind(
-            "simulator",
-            "cfx.simulation.base:Simulator",
-            first="cfx.simulation.contract:FIRST",
-        ),
-        Kind(
-            "objective",
-            "cfx.calibration.objectives:Objective",
-            first="cfx.calibration.contract:FIRST_OF_OBJECTIVES",
-        ),
-        Kind("input", "cfx.policies.inputs.base:PolicyInput", group="policy.inputs", chosen=False),
-        Kind("engine", "cfx.core.engine:Engine"),
-        Kind("learner", "cfx.learners.base:Learner"),
-        Kind("protocol", "cfx.evaluation.protocols.base:Protocol"),
-        Kind(
-            "metric",
-            "cfx.evaluation.metrics.base:Metric",
-            group="metrics",
-            first="cfx.evaluation.metrics.contract:FIRST",
-            chosen=False,
-        ),
-        Kind("table", "cfx.results.table:ResultTable", chosen=False),
-        Kind("demo", "cfx.evaluation.demo:Demo"),
-        Kind("command", "cfx.core.command:Command", chosen=False),
-    )
-}
+def _by_name(*kinds: Kind) -> dict[str, Kind]:
+    return {kind.name: kind for kind in kinds}
+
+
+KINDS = _by_name(
+    Kind("dataset", "cfx.data.base:Dataset", group="data"),
+    Kind("model", "cfx.models.base:DrivingModel", first="cfx.models.contract:FIRST"),
+    Kind("policy", "cfx.policies.base:Policy", first="cfx.policies.contract:FIRST"),
+    Kind(
+        "optimizer",
+        "cfx.calibration.optimizers:Optimizer",
+        first="cfx.calibration.contract:FIRST_OF_OPTIMIZERS",
+    ),
+    Kind(
+        "simulator",
+        "cfx.simulation.base:Simulator",
+        first="cfx.simulation.contract:FIRST",
+    ),
+    Kind(
+        "objective",
+        "cfx.calibration.objectives:Objective",
+        first="cfx.calibration.contract:FIRST_OF_OBJECTIVES",
+    ),
+    Kind("input", "cfx.policies.inputs.base:PolicyInput", group="policy.inputs", chosen=False),
+    Kind("engine", "cfx.core.engine:Engine"),
+    Kind("learner", "cfx.learners.base:Learner"),
+    Kind("protocol", "cfx.evaluation.protocols.base:Protocol"),
+    Kind(
+        "metric",
+        "cfx.evaluation.metrics.base:Metric",
+        group="metrics",
+        first="cfx.evaluation.metrics.contract:FIRST",
+        chosen=False,
+    ),
+    Kind("table", "cfx.results.table:ResultTable", chosen=False),
+    Kind("demo", "cfx.evaluation.demo:Demo"),
+    Kind("command", "cfx.core.command:Command", chosen=False),
+)
 """All kinds, by name."""
 
-SIMPLE_KINDS: dict[str, Kind] = {
-    kind.name: kind
-    for kind in (
-        Kind("figure", "cfx.results.figure:JobFigure", chosen=False),
-        Kind("head", "cfx.policies.heads.base:ParameterHead", group="learner.head", chosen=False),
-        Kind("export", "cfx.core.command:ExportFormat", chosen=False),
-        Kind(
-            "posterior",
-            "cfx.calibration.posterior:PosteriorMethod",
-            group="calibration.posterior",
-            chosen=False,
-        ),
-        Kind("tracker", "cfx.results.tracker:Tracking", group="tracking.name", chosen=False),
-    )
-}
+SIMPLE_KINDS = _by_name(
+    Kind("figure", "cfx.results.figure:JobFigure", chosen=False),
+    Kind("head", "cfx.policies.heads.base:ParameterHead", group="learner.head", chosen=False),
+    Kind("export", "cfx.core.command:ExportFormat", chosen=False),
+    Kind(
+        "posterior",
+        "cfx.calibration.posterior:PosteriorMethod",
+        group="calibration.posterior",
+        chosen=False,
+    ),
+    Kind("tracker", "cfx.results.tracker:Tracking", group="tracking.name", chosen=False),
+)
 """Kinds of classes that come in the same way, have no settings, and no contract in cfx-contracts.
 
 Other distributions have more of them, by an entry point of the group `cfx.kinds` each.
@@ -473,7 +471,7 @@ def _installed(
     kind: str,
     search_path: tuple[tuple[str, float], ...],  # noqa: ARG001 - part of the cache's key
 ) -> tuple[Installed[Any], ...]:
-    made = []
+    components = []
     for announced in entries(kind):
         others = rivals(announced)
         if others:
@@ -486,8 +484,8 @@ def _installed(
                 raise
             _warn_of_left_out(announced, str(error))
             continue
-        made.append(Installed(kind, announced.name, component, announced.distribution))
-    return tuple(sorted(made, key=lambda one: (one.component.order, one.name)))
+        components.append(Installed(kind, announced.name, component, announced.distribution))
+    return tuple(sorted(components, key=lambda one: (one.component.order, one.name)))
 
 
 def _warn_of_left_out(component: Entry | Installed[Any], reason: str) -> None:

@@ -399,20 +399,20 @@ def _require_different(parts: Sequence[PairSet]) -> None:
     """Raises DataError if a pair stands in two of the files."""
     sources: dict[str, tuple[str, str]] = {}
     for part in parts:
-        here: dict[str, tuple[str, str]] = {}
+        sources_of_part: dict[str, tuple[str, str]] = {}
         for pair in part:
             for key in (pair.pair_id, pair.content):
                 if key in sources:
                     source, name = sources[key]
-                    there = ""
+                    name_there = ""
                     if name != pair.pair_id:
-                        there = f", there '{pair.pair_id}',"
+                        name_there = f", there '{pair.pair_id}',"
                     raise DataError(
-                        f"{source} and {part.source}: pair '{name}'{there} stands in both files;"
-                        " leave it out of one of them"
+                        f"{source} and {part.source}: pair '{name}'{name_there} stands in both"
+                        " files; leave it out of one of them"
                     )
-                here[key] = (part.source, pair.pair_id)
-        sources |= here
+                sources_of_part[key] = (part.source, pair.pair_id)
+        sources |= sources_of_part
 
 
 _NOUNS = {

@@ -136,13 +136,15 @@ class Written:
         Raises:
             Unreadable: different cells have different ones.
         """
-        marks = [mark for mark in _MARKS if self.has[mark].any()]
-        if len(marks) < len(_MARKS):
-            return marks[0] if marks else None
-        usual, odd = sorted(_MARKS, key=lambda mark: -int(self.has[mark].sum()))
-        row = int(np.flatnonzero(self.has[odd])[0])
+        more_frequent, rarer = sorted(_MARKS, key=lambda mark: -int(self.has[mark].sum()))
+        if not self.has[more_frequent].any():
+            return None
+        rows = np.flatnonzero(self.has[rarer])
+        if not len(rows):
+            return more_frequent
+        row = int(rows[0])
         raise Unreadable(
-            f"{self._cell(row)} is not a number; write decimals with {_SPOKEN[usual]}"
+            f"{self._cell(row)} is not a number; write decimals with {_SPOKEN[more_frequent]}"
             " in every cell",
             row,
         )
@@ -174,28 +176,26 @@ class Written:
 
     def _mark_beside(self, marks: Sequence[str]) -> str:
         """Returns the decimal mark of a column whose cells leave it open."""
-        open_to = {}
-        for mark in _MARKS:
-            open_to[mark] = np.flatnonzero(self.marks_thousands[mark])
-        if not len(open_to["."]) and not len(open_to[","]):
+        with_comma = np.flatnonzero(self.marks_thousands["."])  # "1,234"
+        with_point = np.flatnonzero(self.marks_thousands[","])  # "1.234"
+        if not len(with_comma) and not len(with_point):
             return "."  # whole numbers
-        if len(open_to["."]) and len(open_to[","]):
-            # "1,234" and "1.234": one of them has decimals.
-            row = int(max(open_to["."][0], open_to[","][0]))
+        if len(with_comma) and len(with_point):  # one of them has decimals
+            row = int(max(with_comma[0], with_point[0]))
             raise Unreadable(
                 f"{self._cell(row)} is not a number as the cells above are; write decimals with a"
                 " point in every cell, and thousands without a mark",
                 row,
             )
-        if len(open_to[","]):  # "1.234": a point marks decimals, unless commas do so elsewhere
+        if len(with_point):  # a point marks decimals, unless commas do so elsewhere
             if "," not in marks:
                 return "."
-            row = int(open_to[","][0])
-        else:  # "1,234"
+            row = int(with_point[0])
+        else:
             if len(marks) == 1:
                 return marks[0]
-            row = int(open_to["."][0])
-        raise self._open(row)
+            row = int(with_comma[0])
+        raise self._ambiguous(row)
 
     def _check_thousands(self, mark: str) -> None:
         """Raises Unreadable where a mark of thousands may be a decimal mark after all.
@@ -209,16 +209,16 @@ class Written:
             return
         row = int(doubtful[0])
         if (_matches(self.text, _LONG_WHOLE) & ~thousands).any():
-            raise self._open(row)
+            raise self._ambiguous(row)
         has_decimals = self.has[mark] & ~thousands
         if has_decimals.any() and not (self.has[mark] & thousands).any():
-            raise self._open(row)
+            raise self._ambiguous(row)
 
-    def _open(self, row: int) -> Unreadable:
-        """Returns that a cell may be two numbers."""
-        written = str(self.text[row].as_py())
-        whole = written.replace(",", "").replace(".", "")
-        decimal = written.replace(",", ".")
+    def _ambiguous(self, row: int) -> Unreadable:
+        """Returns the error that a cell may be two different numbers."""
+        text = str(self.text[row].as_py())
+        whole = text.replace(",", "").replace(".", "")
+        decimal = text.replace(",", ".")
         return Unreadable(
             f"{self._cell(row)} may be {decimal} or {whole}, and nothing beside it says which;"
             " write decimals with a point, and thousands without a mark",
@@ -234,17 +234,18 @@ def _matches(text: Any, expression: str) -> NDArray[np.bool_]:
 
 
 def _marks(column: Any) -> NDArray[np.bool_]:
-    """Returns an Arrow column of truths as an array."""
+    """Returns a column of true and false as an array."""
     return np.asarray(column.to_numpy(zero_copy_only=False), dtype=bool)
 
 
 def _no_number(cell: str) -> str:
     """Returns what to say of a cell that is no number."""
     remedy = "correct it"
-    if "," in cell and any(character.isdigit() for character in cell) and ":" not in cell:
-        remedy = "write decimals with a point"
-    elif ":" in cell and any(character.isdigit() for character in cell):
+    has_digits = any(map(str.isdigit, cell))
+    if ":" in cell and has_digits:
         remedy = "write the seconds since a frame of your choice"
+    elif "," in cell and has_digits:
+        remedy = "write decimals with a point"
     elif cell[:1].isdigit() and cell[-1:].isalpha():
         remedy = "write the number alone, and say its unit in data.units"
     return f"'{cell}' is not a number; {remedy}"
@@ -312,7 +313,7 @@ def parsed(columns: Mapping[str, Floats | Written]) -> dict[str, Floats]:
 
 @contextmanager
 def in_column(name: str) -> Iterator[None]:
-    """Names the column of what is found to be unreadable."""
+    """Adds the column's name to an `Unreadable` that the block raises."""
     try:
         yield
     except Unreadable as error:
@@ -321,7 +322,7 @@ def in_column(name: str) -> Iterator[None]:
 
 
 def _stored(column: Any) -> Any:
-    """Returns a column without what only says how it is stored."""
+    """Returns a column's values: dictionaries, run lengths and extension types are resolved."""
     kind = column.type
     if isinstance(kind, pa.BaseExtensionType):
         storage = kind.storage_type
@@ -466,22 +467,21 @@ def names_in(column: Any) -> NameColumn:
     if not isinstance(column.type, pa.BaseExtensionType) and pa.types.is_nested(column.type):
         raise Unreadable(f"holds {column.type}, not names; write a text or a number in each row")
     codes, cells = _encoded(column)
-    written: list[str | None] = []
-    for cell in cells:
-        written.append(name_of(cell) or None)
-    named = [name for name in written if name is not None]
-    if len(named) > 1 and all(_WITH_ZEROS.fullmatch(name) for name in named):
+    texts = pd.Series(list(map(name_of, cells)), dtype=object).replace("", None)
+    ids = texts.dropna()
+    if len(ids) > 1 and ids.map(_WITH_ZEROS.fullmatch).notna().all():
         # Several ids will not all be multiples of 1000: the comma marks decimals.
-        for number, name in enumerate(written):
-            if name is not None:
-                written[number] = name.partition(",")[0]
-    merged, names = pd.factorize(np.array(written, dtype=object))  # an empty name has code -1
+        texts = texts.str.partition(",")[0]
+    merged, names = pd.factorize(texts.to_numpy(dtype=object))  # an empty name has code -1
     with_missing = np.append(merged, -1).astype(np.int64)
     return NameColumn(with_missing[codes], list(names))
 
 
 def _encoded(column: Any) -> tuple[Ints, list[Any]]:
-    """Returns what each cell holds, and where each row's is, `(N,)`; the last stands for none."""
+    """Returns the different cells, and for each row the number of its cell, `(N,)`.
+
+    An empty cell has the number after the last.
+    """
     if not pa.types.is_dictionary(column.type):
         is_uuid = getattr(column.type, "extension_name", "") == "arrow.uuid"
         if is_uuid:

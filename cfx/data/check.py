@@ -71,7 +71,7 @@ def judge(pairs: PairSet, check: Check, units: Units | None = None) -> Verdict:
     if check == "off" or not len(pairs):
         return Verdict("")
     broken = list(contradictions(pairs, units))
-    names = tuple(name for name, _ in broken)
+    names = tuple(dict(broken))
     sentences = []
     for remark in pairs.remarks:
         if remark.is_contradiction:
@@ -159,15 +159,15 @@ def _of_pairs(
     for name, contradiction in broken:
         sentence = _NUMBERS.sub("", contradiction.text(units))
         by_sentence.setdefault(sentence, []).append((name, contradiction))
-    parts = []
-    for alike in sorted(by_sentence.values(), key=len, reverse=True)[:_SHOWN]:
-        names = listed([f"'{name}'" for name, _ in alike], _SHOWN)
-        typical = sorted(alike, key=_slope)[len(alike) // 2][1]
-        parts.append(f"{typical.text(units)} (pairs: {names})")
-    others = len(pairs) - len(broken)
-    if others > len(broken):
-        parts.append(f"the other {others} pairs agree in these units")
-    return f"{count}: {'; '.join(parts)}"
+    explanations = []
+    for same_sentence in sorted(by_sentence.values(), key=len, reverse=True)[:_SHOWN]:
+        names = listed([f"'{name}'" for name in dict(same_sentence)], _SHOWN)
+        _, typical = sorted(same_sentence, key=_slope)[len(same_sentence) // 2]
+        explanations.append(f"{typical.text(units)} (pairs: {names})")
+    coherent = len(pairs) - len(broken)
+    if coherent > len(broken):
+        explanations.append(f"the other {coherent} pairs agree in these units")
+    return f"{count}: {'; '.join(explanations)}"
 
 
 def _slope(broken: tuple[str, Contradiction]) -> float:

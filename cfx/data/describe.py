@@ -321,7 +321,7 @@ def _text(pieces: Sequence[RenderableType], width: int = _WIDTH) -> str:
     console = Console(file=text, width=width, highlight=False, markup=False, emoji=False)
     for piece in pieces:
         console.print(piece, soft_wrap=isinstance(piece, str))
-    return "\n".join(line.rstrip() for line in text.getvalue().splitlines())
+    return "\n".join(map(str.rstrip, text.getvalue().splitlines()))
 
 
 def dataset_of(path: Path) -> str:
@@ -386,20 +386,21 @@ _WRITTEN_UNITS = {
 
 def _own_columns(path: Path, columns: Sequence[str]) -> str:
     """Returns what to write for a table whose columns have names of their own."""
-    taken: dict[str, str] = {}
+    column_of: dict[str, str] = {}
     units = []
     for quantity, expression in _QUANTITIES.items():
         for name in columns:
-            if name not in taken.values() and re.search(expression, name.lower()):
-                taken[quantity] = name
+            if name not in column_of.values() and re.search(expression, name.lower()):
+                column_of[quantity] = name
                 break
-        unit = _unit_in(taken.get(quantity, ""), quantity)
+        unit = _unit_in(column_of.get(quantity, ""), quantity)
         if unit:
             units.append((quantity, unit))
     words = []
     for quantity in _QUANTITIES:
-        words.append(f"data.columns.{quantity}={shlex.quote(taken.get(quantity, 'COLUMN'))}")
-    words += [f"data.units.{quantity}={unit}" for quantity, unit in units]
+        words.append(f"data.columns.{quantity}={shlex.quote(column_of.get(quantity, 'COLUMN'))}")
+    for quantity, unit in units:
+        words.append(f"data.units.{quantity}={unit}")
     return (
         "If it is a table of pairs, a row for each pair and frame, say what its columns are, and"
         f" their units: cfx data describe {shlex.quote(str(path))} {' '.join(words)}"
@@ -409,8 +410,8 @@ def _own_columns(path: Path, columns: Sequence[str]) -> str:
 
 def _unit_in(name: str, quantity: str) -> str:
     """Returns the unit that a column's name says it has; "" if none."""
-    fits = {"time": ("ms", "us", "ns"), "gap": ("ft",)}.get(quantity, ("km/h", "mph", "ft/s"))
-    for unit in fits:
+    units_of = {"time": ("ms", "us", "ns"), "gap": ("ft",)}
+    for unit in units_of.get(quantity, ("km/h", "mph", "ft/s")):
         if quantity != "pair_id" and re.search(_WRITTEN_UNITS[unit], name.lower()):
             return unit
     return ""
@@ -429,7 +430,10 @@ def _usable(entry: Entry) -> type[Dataset] | None:
 
 def _lengths(pairs: PairSet) -> list[tuple[int, float]]:
     """Returns the frames of each pair, and its time step, s."""
-    return [(len(pair), round(pair.dt, 9)) for pair in pairs]
+    lengths = []
+    for pair in pairs:
+        lengths.append((len(pair), round(pair.dt, 9)))  # 0.1 is the same step however it was made
+    return lengths
 
 
 def _advice(pairs: Sequence[tuple[int, float]], usual: float) -> tuple[str, list[str]]:
@@ -442,31 +446,33 @@ def _advice(pairs: Sequence[tuple[int, float]], usual: float) -> tuple[str, list
     if not pairs:
         return "", []
     options = ""
-    recorded_steps = {dt for _, dt in pairs}
-    step = max(recorded_steps)
-    if len(recorded_steps) > 1:
+    _, recorded_steps = np.array(pairs).T
+    step = float(recorded_steps.max())
+    if recorded_steps.min() < step:
         options = f" data.time_step={step:g}"
-    in_steps = [frames_in_steps(frames, dt, step) for frames, dt in pairs]
+    in_steps = []
+    for frames, dt in pairs:
+        in_steps.append(frames_in_steps(frames, dt, step))
     durations = np.sort(np.array(in_steps) * step)
     median = float(durations[(len(durations) - 1) // 2])
-    least = usual
+    min_duration = usual
     if np.count_nonzero(durations >= usual - _ROUNDING_S) * 2 < len(durations):
-        least = rounded_down(median)
-        if least > _ROUND_S:
-            least = least // _ROUND_S * _ROUND_S
-        options += f" data.min_duration={least:g}"
-    long = np.count_nonzero(durations >= least - _ROUNDING_S)
-    if long == len(durations):
-        return options, [f"It keeps all {long:,} pairs."]
+        min_duration = rounded_down(median)
+        if min_duration > _ROUND_S:
+            min_duration = min_duration // _ROUND_S * _ROUND_S
+        options += f" data.min_duration={min_duration:g}"
+    kept = np.count_nonzero(durations >= min_duration - _ROUNDING_S)
+    if kept == len(durations):
+        return options, [f"It keeps all {kept:,} pairs."]
     shortest = rounded_down(float(durations[0]))
     return options, [
-        f"It keeps {long:,} of {len(durations):,} pairs and leaves out {len(durations) - long:,}"
-        f" shorter than {least:g} s; data.min_duration={shortest:g} keeps all."
+        f"It keeps {kept:,} of {len(durations):,} pairs and leaves out {len(durations) - kept:,}"
+        f" shorter than {min_duration:g} s; data.min_duration={shortest:g} keeps all."
     ]
 
 
 def _without_length(pairs: PairSet) -> list[str]:
-    """Returns what follows from leaders whose length is not known."""
+    """Returns a sentence on leaders whose length is not known; nothing where all are."""
     unknown = len(pairs) - len(_with_length(pairs))
     if not unknown:
         return []
@@ -477,8 +483,12 @@ def _without_length(pairs: PairSet) -> list[str]:
 
 
 def _with_length(pairs: Sequence[Pair]) -> list[Pair]:
-    """Returns the pairs the length of whose leader is known."""
-    return [pair for pair in pairs if pair.leader_length > 0]
+    """Returns the pairs whose leader's length is known."""
+    with_length = []
+    for pair in pairs:
+        if pair.leader_length > 0:
+            with_length.append(pair)
+    return with_length
 
 
 def _overview(layout: str, contents: Contents, units: Mapping[str, str]) -> Table:
@@ -501,7 +511,9 @@ def _overview(layout: str, contents: Contents, units: Mapping[str, str]) -> Tabl
     table.add_row("rows", f"{contents.rows:,}")
     table.add_row("vehicles", _vehicles(contents))
     if units:
-        read_in = [f"{name.replace('_', ' ')} in {unit}" for name, unit in units.items()]
+        read_in = []
+        for name, unit in units.items():
+            read_in.append(f"{name.replace('_', ' ')} in {unit}")
         table.add_row("units", f"as read: {listed(read_in, 10)}; converted to SI units")
     with_pairs = "none with pairs"
     if recordings:
@@ -510,7 +522,7 @@ def _overview(layout: str, contents: Contents, units: Mapping[str, str]) -> Tabl
     table.add_row("lanes", listed(sorted(lanes)) or "not known")
     drivers = len(driver_names(pairs))
     table.add_row("pairs", f"{len(pairs):,} of {drivers:,} drivers, {pairs.frames:,} frames")
-    table.add_row("time step", listed([f"{step:g} s" for step in sorted(steps)]) or "-")
+    table.add_row("time step", listed(list(map("{:g} s".format, sorted(steps)))) or "-")
     for duration in _THRESHOLDS_S:
         long = 0
         for pair in pairs:

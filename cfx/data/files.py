@@ -89,6 +89,7 @@ _CONTROL = re.compile(rb"[\x00-\x08\x0b\x0e-\x1f]")
 """Bytes below 32 that no text has: all but tab, line feed, form feed and carriage return."""
 
 _TAR_AT, _TAR = 257, b"ustar"
+"""Where a tar archive says that it is one (POSIX.1-1988): behind the fields of its first file."""
 
 _HEAD = 1 << 16
 """Bytes that are looked at before a file is read."""
@@ -213,7 +214,7 @@ def separator_of(line: str, *, spaces: bool = False) -> str:
     if not has_letters(line.lower().replace("e+", "").replace("e-", "")):
         if spaces and not counts[";"] + counts["|"] and re.search(r"\t\s|[^,\s] +\S", line):
             counts["\t"] = 0  # columns are aligned, in part by tabs
-        if any(counts[separator] for separator in _SEPARATORS[:-1]):
+        if counts[";"] + counts["\t"] + counts["|"]:
             counts[","] = 0  # nothing but commas stands in numbers
         elif spaces and len(re.findall(r"(?<![,\s])\s+(?![,\s])", line)) > counts[","]:
             return " "
@@ -226,12 +227,12 @@ def cells_of(line: str, separator: str) -> list[str]:
     if separator == " ":
         return line.split()
     cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
-    return [cell.strip() for cell in cells]
+    return list(map(str.strip, cells))
 
 
 def has_letters(text: str) -> bool:
     """Says whether a text has a letter, as names of columns have and numbers have not."""
-    return any(character.isalpha() for character in text)
+    return any(map(str.isalpha, text))
 
 
 def stem(path: Path) -> str:
@@ -302,8 +303,15 @@ def _unpacked(path: Path) -> io.BufferedReader:
 def _packing_of(path: Path) -> str:
     """Returns how a file is packed; "" if it is not."""
     with path.open("rb") as file:
-        start = file.read(6)
-    return next((name for magic, name in _PACKINGS.items() if start.startswith(magic)), "")
+        return _packing(file.read(6))
+
+
+def _packing(start: bytes) -> str:
+    """Returns how a file is packed that begins so; "" if it is not."""
+    for magic, name in _PACKINGS.items():
+        if start.startswith(magic):
+            return name
+    return ""
 
 
 def _in_zip(path: Path) -> Any:
@@ -364,7 +372,7 @@ def _refuse(path: Path, head: bytes) -> None:
         reason = "a tar archive", _UNPACK
     if _PICKLES.match(head):
         reason = "a pickle, which runs whatever code it holds when it is read", _AS_TABLE
-    packing = next((name for magic, name in _PACKINGS.items() if head.startswith(magic)), "")
+    packing = _packing(head)
     if packing:
         reason = f"packed more than once ({packing} inside)", _UNPACK
     if reason is not None:

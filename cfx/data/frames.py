@@ -181,17 +181,22 @@ def _of_several(sources: Iterable[Any]) -> Frame | None:
     sources = list(sources)
     if not sources:
         return None
-    if all(_is_row(source) for source in sources):
+    if all(map(_is_row, sources)):
         return _of_pandas(pd.DataFrame(sources))
-    frames = [frame_of_source(source) for source in sources]
-    tables = [frame for frame in frames if frame is not None]
+    tables: list[Frame] = []
+    others: list[Any] = []
+    for source in sources:
+        table = frame_of_source(source)
+        if table is None:
+            others.append(source)
+        else:
+            tables.append(table)
     if not tables:
         return None
-    if len(tables) < len(frames):
-        other = sources[frames.index(None)]
+    if others:
         raise ConfigError(
-            f"some of the list are tables, and one is a {type(other).__name__}; give tables alone,"
-            " or paths alone"
+            f"some of the list are tables, and one is a {type(others[0]).__name__}; give tables"
+            " alone, or paths alone"
         )
     names: dict[str, None] = {}
     for table in tables:
@@ -215,18 +220,16 @@ def _is_row(source: object) -> bool:
 
 def _one_column(tables: list[Frame], name: str) -> Any:
     """Returns a column of several tables; one that lacks it has empty cells."""
-    parts, types = [], []
+    columns, types = [], []
     for table in tables:
         if name in table.names:
-            part = table.column(table.names.index(name))
-            types.append(part.type)
+            column = table.column(table.names.index(name))
+            types.append(column.type)
         else:
-            part = pa.chunked_array([pa.nulls(len(table.column(0)))])
-        parts.append(part)
+            column = pa.chunked_array([pa.nulls(len(table.column(0)))])
+        columns.append(pa.table({name: column}))
     try:
-        joined = pa.concat_tables(
-            [pa.table({name: part}) for part in parts], promote_options="permissive"
-        )
+        joined = pa.concat_tables(columns, promote_options="permissive")
     except pa.ArrowException:
         raise ConfigError(
             f"column {name} is {types[0]} in one of the tables and {types[-1]} in another; give it"
@@ -274,8 +277,8 @@ def _flat(name: Any) -> str:
     """Returns a column's name; of one with several levels, these joined: ("leader", "id")."""
     if not isinstance(name, tuple):
         return str(name).strip()
-    parts = [str(part).strip() for part in name]
-    return "_".join(part for part in parts if part)
+    levels = map(str.strip, map(str, name))
+    return "_".join(filter(None, levels))  # a level without a name is ""
 
 
 def _column_of_pandas(series: pd.Series) -> Any:

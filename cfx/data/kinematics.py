@@ -38,64 +38,68 @@ from cfx.data.tracks import beyond_rates, follows_from_gaps
 from cfx.data.units import factor
 
 _WINDOW_S = 5.0
+"""Length of the windows over which changes are compared, s: longer than noise, and so short that
+a small bias of a speed does not add up."""
 
 _WINDOWS = 200
 """Windows of a pair that are looked at, at least, where it has as many; they overlap."""
 
-_TELLING_FRAMES = 12
-"""In fewer frames it matters whether a rate is that of the step before, behind or around."""
+_MIN_FRAMES = 12
+"""Shorter signals are not compared: in them it matters whether a rate is that of the step before a
+frame, of the step after it, or the mean of both."""
 
-_SAME = 0.08
-"""How far a measured factor may be from one that is known."""
+_FACTOR_ROOM = 0.08
+"""How far, as a share, a slope may be from the factor between two units that explains it."""
 
-_SAME_GAP = 0.12
+_GAP_FACTOR_ROOM = 0.12
 """The same of a gap's change on the relative speed, which is noisier."""
 
-_MOST = 0.75
-"""Share of the windows that count as most of them."""
+_MOST_WINDOWS = 0.75
+"""Of changes over windows this quantile counts: it holds for most windows, and a few bad ones do
+not matter."""
 
-_MISSED = 0.25
-"""Where an integral may miss a larger share of a change, what it leaves over says nothing: at 1 s
-the accelerations of OpenACC's Ispra, which are noisy and whose speeds hardly change."""
+_MAX_MISSED = 0.25
+"""Where an integral may miss a larger share of a change, what it leaves over says nothing. So it is
+at 1 s with the accelerations of OpenACC's Ispra, which are noisy and whose speeds hardly change."""
 
 
 @dataclass(frozen=True)
 class _Rule:
-    """Rule of a signal and the integral of its rate: when it is checked, and its bounds.
+    """When a signal is compared with the integral of its rate, and how far they may differ.
 
     The bounds leave room for all pairs of the recordings that cfx was tried on; docs/readers.md
     has their slopes.
 
     Attributes:
-        spread: of `Agreement` at least, in the signal's unit.
+        spread: a signal that varies less, in its unit, is not checked (`Agreement.spread`).
         floor: how far the logarithm of the slope may always be from 0.
         room: how much farther where the integral explains nothing of the signal.
-        left: bound of `Agreement.left`; half of it where another vehicle's signal, or another time,
-            leaves much less over.
-        typically_left: bound of its median over many pairs.
+        max_left_over: bound of `Agreement.left_over`; half of it where another vehicle's signal, or
+            another time, leaves much less over.
+        max_typical_left_over: bound of its median over many pairs.
     """
 
     spread: float
     floor: float
     room: float
-    left: float = math.inf
-    typically_left: float = math.inf
+    max_left_over: float = math.inf
+    max_typical_left_over: float = math.inf
 
-    def breaks_slope(self, agreed: Agreement) -> bool:
-        """Says whether a slope is out of its bounds; no if it says nothing."""
-        if agreed.spread < self.spread or agreed.unexplained > 0.95:
+    def breaks_slope(self, agreement: Agreement) -> bool:
+        """Says whether a slope is out of its bounds; False where the signals vary too little."""
+        if agreement.spread < self.spread or agreement.unexplained > 0.95:
             return False
-        if agreed.slope <= 0:
+        if agreement.slope <= 0:
             return True
-        return abs(math.log(agreed.slope)) > self.floor + self.room * agreed.unexplained
+        return abs(math.log(agreement.slope)) > self.floor + self.room * agreement.unexplained
 
-    def leaves_over(self, agreed: Agreement) -> bool:
-        """Says whether the integral may leave too much of the signal over."""
-        return self.tells(agreed) and agreed.left > self.left / 2
+    def may_leave_too_much(self, agreement: Agreement) -> bool:
+        """Says whether what the integral leaves over of the signal needs a closer look."""
+        return self.can_judge(agreement) and agreement.left_over > self.max_left_over / 2
 
-    def tells(self, agreed: Agreement) -> bool:
-        """Says whether what the integral leaves over of a signal says anything."""
-        return agreed.change >= 2 * self.spread and agreed.missed < _MISSED
+    def can_judge(self, agreement: Agreement) -> bool:
+        """Says whether the signal varies, and its integral is known, enough to be compared."""
+        return agreement.change >= 2 * self.spread and agreement.missed < _MAX_MISSED
 
 
 _WHOLE = _Rule(spread=10.0, floor=0.17, room=0.0)
@@ -159,24 +163,26 @@ class Agreement:
         spread: standard deviation of the signal or of the integral, whichever is larger, in the
             signal's unit.
         change: of the signal or of the integral in most windows.
-        left: what the integral leaves over of it, as a share, beside what it may miss.
-        missed: what the integral may miss between frames, as a share.
+        left_over: what the integral leaves over of that change, as a share, beside `missed`.
+        missed: what the integral may miss between frames of that change, as a share.
     """
 
     slope: float
     correlation: float
     spread: float
     change: float
-    left: float
+    left_over: float
     missed: float = 0.0
 
     @property
     def unexplained(self) -> float:
-        """The part of the one's standard deviation that the other does not explain, 0 to 1."""
+        """Share of the signal's standard deviation that the integral does not explain, 0 to 1."""
         return math.sqrt(max(0.0, 1.0 - self.correlation**2))
 
 
-def agreement(values: Floats, rates: Floats, dt: float, *, whole: bool = False) -> Agreement:
+def measured_agreement(
+    values: Floats, rates: Floats, dt: float, *, whole: bool = False
+) -> Agreement:
     """Measures how a signal changes beside the integral of its rate.
 
     The rate's integral is that of the rule that the signal follows best. What is not known of the
@@ -188,7 +194,7 @@ def agreement(values: Floats, rates: Floats, dt: float, *, whole: bool = False) 
         dt: time step, s.
         whole: the course since the first frame is compared, not changes over windows.
     """
-    if len(values) < _TELLING_FRAMES:
+    if len(values) < _MIN_FRAMES:
         return Agreement(math.nan, 0.0, 0.0, 0.0, 0.0)
     mean = np.zeros(len(rates))
     np.cumsum(rates[1:] + rates[:-1], out=mean[1:])
@@ -208,17 +214,17 @@ def agreement(values: Floats, rates: Floats, dt: float, *, whole: bool = False) 
     of_y = math.sqrt(float(y @ y))
     x, of_x, correlation = _best_integral(y, of_y, mean, turn)
     spread = max(of_x, of_y) / math.sqrt(len(x))
-    change = max(_quantile(np.abs(x), _MOST), _quantile(np.abs(y), _MOST))
-    left = missed = 0.0
+    change = max(_quantile(np.abs(x), _MOST_WINDOWS), _quantile(np.abs(y), _MOST_WINDOWS))
+    left_over = missed = 0.0
     if change > 0:
-        missed = _quantile(np.abs(unknown), _MOST) / change
-        left = max(0.0, _quantile(np.abs(y - x), _MOST) / change - missed)
+        missed = _quantile(np.abs(unknown), _MOST_WINDOWS) / change
+        left_over = max(0.0, _quantile(np.abs(y - x), _MOST_WINDOWS) / change - missed)
     if min(of_x, of_y) <= 1e-6 * max(of_x, of_y):
-        return Agreement(math.nan, 0.0, spread, change, left, missed)
+        return Agreement(math.nan, 0.0, spread, change, left_over, missed)
     # Errors that do not go with the signal widen the integral as they lower the correlation.
     certain = math.sqrt(max(of_x**2 - float(unknown @ unknown), (correlation * of_x) ** 2))
     slope = math.copysign(of_y / max(certain, 1e-6 * of_x), correlation)
-    return Agreement(slope, correlation, spread, change, left, missed)
+    return Agreement(slope, correlation, spread, change, left_over, missed)
 
 
 def _best_integral(
@@ -290,21 +296,21 @@ class Contradiction:
     other_slope: float | None = None
 
     def text(self, units: Units | None = None) -> str:
-        """Returns what contradicts what, and why probably.
+        """Returns which signals contradict each other, and the probable reason.
 
         Args:
             units: those that the file is said to have in place of SI units.
         """
         if self.slope is None or self.words:
             return f"{self.signals}: {self.words}"
-        return f"{self.signals}: {self._why(self.slope, units or {})}"
+        return f"{self.signals}: {self._reason(self.slope, units or {})}"
 
-    def _why(self, slope: float, units: Units) -> str:
-        """Returns what a slope says, and of which unit, sign or time step it is."""
+    def _reason(self, slope: float, units: Units) -> str:
+        """Returns what a slope says, and which unit, sign or time step would explain it."""
         step = f"the time step looks like {slope * self.dt:.3g} s, not {self.dt:.3g} s"
         other = self.other_slope
         read_in = _units_of(self.signals.partition("_")[0], units)
-        room = _SAME
+        room = _FACTOR_ROOM
         if self.quantity == "gap":
             finding = f"the gap changes {slope:.3g} times as the relative speed says"
             explanations = {-1.0: "the leader's and the follower's columns look swapped"}
@@ -313,10 +319,14 @@ class Contradiction:
                 f"gaps must be in {read_in['gap']}, speeds in {read_in['speed']}, times in"
                 f" {read_in['time']}"
             )
-            room = _SAME_GAP
+            room = _GAP_FACTOR_ROOM
         elif self.quantity == "speed":
             finding = f"speeds change {slope:.3g} times as much as the accelerations say"
-            if other is not None and abs(other - 1) > _TYPICAL and abs(slope / other - 1) < _SAME:
+            if (
+                other is not None
+                and abs(other - 1) > _TYPICAL
+                and abs(slope / other - 1) < _FACTOR_ROOM
+            ):
                 return f"{finding}, and positions as much more than the speeds say, so {step}"
             explanations = _ACCELERATION_FACTORS | _factors(
                 read_in, faster=("acceleration",), slower=("speed",)
@@ -326,7 +336,7 @@ class Contradiction:
             finding = f"the distance driven is {slope:.3g} times speed times time"
             if slope < 0:
                 return f"{finding}: positions must grow along the lane"
-            if other is not None and abs(other / slope - 1) < _SAME:
+            if other is not None and abs(other / slope - 1) < _FACTOR_ROOM:
                 finding += ": speeds change as much faster than the accelerations say"
                 return f"{finding}, so {step}"
             explanations = _factors(read_in, faster=("speed", "time"), slower=("position",))
@@ -351,26 +361,36 @@ class _Relation(NamedTuple):
 
     def measured(self, *, whole: bool = False) -> Agreement:
         """Returns how changes over windows agree, or over the whole pair."""
-        return agreement(self.values, self.rates, self.pair.dt, whole=whole)
+        return measured_agreement(self.values, self.rates, self.pair.dt, whole=whole)
 
-    def broken(
-        self, slope: float | None, words: str = "", also: Agreement | None = None
+    def contradiction(
+        self, slope: float | None, words: str = "", of_other_signal: Agreement | None = None
     ) -> Contradiction:
-        """Returns that the two contradict each other; `also` is of the vehicle's other signal."""
+        """Returns that signal and rate contradict each other.
+
+        Args:
+            slope: of the signal on the integral; None where another thing is wrong.
+            words: what is wrong, where the slope does not say it.
+            of_other_signal: how the vehicle's other signal agrees with its rate; one that the
+                integral hardly explains says nothing.
+        """
         other_slope = None
-        if also is not None and also.unexplained < 0.2:
-            other_slope = also.slope
+        if of_other_signal is not None and of_other_signal.unexplained < 0.2:
+            other_slope = of_other_signal.slope
         return Contradiction(self.signals, self.quantity, slope, words, self.pair.dt, other_slope)
 
 
 def _relations(pair: Pair, who: str) -> tuple[_Relation, _Relation]:
     """Returns position and speed, and speed and acceleration, of leader or follower."""
-    names = f"{who}_position", f"{who}_speed", f"{who}_acceleration"
-    position, speed, acceleration = (getattr(pair, name) for name in names)
-    return (
-        _Relation(pair, f"{names[0]} and {names[1]}", "position", position, speed),
-        _Relation(pair, f"{names[1]} and {names[2]}", "speed", speed, acceleration),
-    )
+    speed = f"{who}_speed"
+    return _relation(pair, f"{who}_position", speed), _relation(pair, speed, f"{who}_acceleration")
+
+
+def _relation(pair: Pair, signal: str, rate: str) -> _Relation:
+    """Returns a signal of leader or follower and its rate, both by name."""
+    _, _, quantity = signal.partition("_")
+    values, rates = getattr(pair, signal), getattr(pair, rate)
+    return _Relation(pair, f"{signal} and {rate}", quantity, values, rates)
 
 
 def _gap_relation(pair: Pair) -> _Relation:
@@ -379,7 +399,7 @@ def _gap_relation(pair: Pair) -> _Relation:
 
 
 def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | None:
-    """Returns what of a pair contradicts what; None if nothing does.
+    """Returns the first contradiction between signals of a pair; None if there is none.
 
     Args:
         units: those that its file is said to have; its signals are in SI units.
@@ -387,10 +407,10 @@ def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | Non
     for who, other in (("leader", "follower"), ("follower", "leader")):
         position, speed = _relations(pair, who)
         of_position, of_speed = _relations(pair, other)
-        problem = _broken(position, of_position, speed.measured())
+        problem = _contradiction_in(position, of_position, speed.measured())
         if problem is not None:
             return _by_gap(problem, pair, units or {})
-        problem = _broken(speed, of_speed, position.measured(whole=True))
+        problem = _contradiction_in(speed, of_speed, position.measured(whole=True))
         if problem is not None:
             return problem
     problem = _over_windows(_gap_relation(pair), None, None)
@@ -399,43 +419,62 @@ def contradiction(pair: Pair, units: Units | None = None) -> Contradiction | Non
     return _by_gap(problem, pair, units or {})
 
 
-def _broken(relation: _Relation, other: _Relation, also: Agreement) -> Contradiction | None:
-    """Returns that a signal is not what its rate says; `also` is of this vehicle's other signal."""
+def _contradiction_in(
+    relation: _Relation, of_neighbour: _Relation, of_other_signal: Agreement
+) -> Contradiction | None:
+    """Compares a signal with its rate; None if it changes as the rate says.
+
+    Args:
+        relation: the signal and its rate.
+        of_neighbour: the same signal of the other vehicle: columns may be swapped.
+        of_other_signal: how this vehicle's other signal agrees with its rate.
+    """
     problem = _leap(relation) or _constant(relation)
     if problem is not None:
         return problem
     if relation.quantity == "position":
         whole = relation.measured(whole=True)
         if _WHOLE.breaks_slope(whole):
-            return relation.broken(whole.slope, also=also)
-    return _over_windows(relation, other, also)
+            return relation.contradiction(whole.slope, of_other_signal=of_other_signal)
+    return _over_windows(relation, of_neighbour, of_other_signal)
 
 
 def _over_windows(
-    relation: _Relation, other: _Relation | None, also: Agreement | None
+    relation: _Relation, of_neighbour: _Relation | None, of_other_signal: Agreement | None
 ) -> Contradiction | None:
-    """Returns that a signal's changes over windows are not what its rate says; as `_broken`."""
-    rule, agreed = _RULES[relation.quantity], relation.measured()
-    if rule.breaks_slope(agreed):
-        return relation.broken(agreed.slope, also=also)
-    if not rule.leaves_over(agreed):
+    """Compares a signal's changes over windows with its rate; as `_contradiction_in`."""
+    rule, agreement = _RULES[relation.quantity], relation.measured()
+    if rule.breaks_slope(agreement):
+        return relation.contradiction(agreement.slope, of_other_signal=of_other_signal)
+    if not rule.may_leave_too_much(agreement):
         return None
-    why = _why_left_over(relation, other, agreed.left)
-    if not why and agreed.left < rule.left:
+    reason = _reason_left_over(relation, of_neighbour, agreement.left_over)
+    if not reason and agreement.left_over < rule.max_left_over:
         return None
     words = (
         f"over {_WINDOW_S:g} s the one changes otherwise than the other says, by"
-        f" {agreed.left:.0%} of the change: {why or 'are they of this vehicle, at this time?'}"
+        f" {agreement.left_over:.0%} of the change:"
+        f" {reason or 'are they of this vehicle, at this time?'}"
     )
-    return relation.broken(None, words)
+    return relation.contradiction(None, words)
 
 
-def _why_left_over(relation: _Relation, other: _Relation | None, share: float) -> str:
-    """Returns why a signal does not go with its rate: another vehicle's, or late; "" if unknown."""
+def _reason_left_over(relation: _Relation, of_neighbour: _Relation | None, left_over: float) -> str:
+    """Returns why a signal does not go with its rate: another vehicle's, or late; "" if unknown.
+
+    Args:
+        relation: the signal and its rate.
+        of_neighbour: the same of the other vehicle.
+        left_over: what the rate's integral leaves over of the signal, as a share. Another
+            vehicle's rate must leave much less, one at another time less than 0.4 times as much.
+    """
     dt = relation.pair.dt
-    if other is not None and agreement(relation.values, other.rates, dt).left < share / 3:
-        return f"they go with {other.signals.partition(' and ')[2]}: are the columns swapped?"
-    late, rest = 0, share
+    if of_neighbour is not None:
+        of_swapped = measured_agreement(relation.values, of_neighbour.rates, dt)
+        if of_swapped.left_over < left_over / 3:
+            rate = of_neighbour.signals.partition(" and ")[2]
+            return f"they go with {rate}: are the columns swapped?"
+    delay, least_left_over = 0, left_over  # frames by which the rate is later
     for k in range(1, min(round(_LATEST_S / dt), len(relation.values) // 4) + 1):
         for frames in (k, -k):
             values, rates = relation.values, relation.rates
@@ -443,19 +482,19 @@ def _why_left_over(relation: _Relation, other: _Relation | None, share: float) -
                 values, rates = values[:-k], rates[k:]
             else:
                 values, rates = values[k:], rates[:-k]
-            again = agreement(values, rates, dt).left
-            if again < rest:
-                late, rest = frames, again
-    if rest < share / 2.5:
+            left_over_then = measured_agreement(values, rates, dt).left_over
+            if left_over_then < least_left_over:
+                delay, least_left_over = frames, left_over_then
+    if least_left_over < left_over / 2.5:
         words = "earlier"
-        if late > 0:
+        if delay > 0:
             words = "later"
-        return f"they go together if the second is taken {abs(late) * dt:.3g} s {words}"
+        return f"they go together if the second is taken {abs(delay) * dt:.3g} s {words}"
     return ""
 
 
 def _leap(relation: _Relation) -> Contradiction | None:
-    """Returns the first of a few steps that no vehicle makes; of many, a unit is wrong."""
+    """Finds the first of a few steps that no vehicle makes; many mean a wrong unit."""
     pair, moved = relation.pair, np.diff(relation.values)
     most, rate = _LEAP_MPS + _LEAP_MPS2 * pair.dt, _MOST_MPS2
     if relation.quantity == "position":
@@ -473,11 +512,11 @@ def _leap(relation: _Relation) -> Contradiction | None:
         f"at frame {frame} {what} within a step of {pair.dt:.3g} s ({len(at)} such steps): cut the"
         " pair there, or correct it"
     )
-    return relation.broken(None, words)
+    return relation.contradiction(None, words)
 
 
 def _constant(relation: _Relation) -> Contradiction | None:
-    """Returns that one signal is the same in all frames although the other says otherwise."""
+    """Finds a signal that is the same in all frames although the other one says otherwise."""
     signal, rate = relation.signals.split(" and ")
     has_constant_values = bool((relation.values == relation.values[0]).all())
     has_constant_rates = bool((relation.rates == relation.rates[0]).all())
@@ -485,17 +524,17 @@ def _constant(relation: _Relation) -> Contradiction | None:
         return None
     # Positions grow at a constant speed, too.
     whole = relation.measured(whole=not (has_constant_rates and relation.quantity == "position"))
-    if whole.spread < 2 * _RULES[relation.quantity].spread or whole.left < 0.5:
+    if whole.spread < 2 * _RULES[relation.quantity].spread or whole.left_over < 0.5:
         return None
     name, value = signal, relation.values[0]
     if has_constant_rates:
         name, value = rate, relation.rates[0]
     words = f"{name} is {value:.3g} in every frame, and the other changes"
-    return relation.broken(None, words)
+    return relation.contradiction(None, words)
 
 
 def _by_gap(problem: Contradiction, pair: Pair, units: Units) -> Contradiction:
-    """Returns a contradiction in the words of a file that has gaps in place of positions."""
+    """Explains a contradiction where a file has gaps: its positions were made from them."""
     read_in = _units_of("follower", units)
     if problem.quantity == "speed" or not follows_from_gaps(pair):
         return problem
@@ -524,18 +563,22 @@ def _by_gap(problem: Contradiction, pair: Pair, units: Units) -> Contradiction:
         corrected[f"the follower's speeds {look}"] = (gap, leader, follower * scale)
     likely = dict(slopes_of)
     for words, expected in slopes_of.items():
-        if abs(slope / expected - 1) >= _SAME_GAP:
+        if abs(slope / expected - 1) >= _GAP_FACTOR_ROOM:
             del likely[words]
     if not likely and slope > 0:
         likely[f"the time step looks like {slope * pair.dt:.3g} s, not {pair.dt:.3g} s"] = slope
     for words, scale in likely.items():
         corrected[words] = (gap, leader * scale, follower * scale)
-    best, least, rule = problem.words, 0.5, _RULES["gap"]
+    # The correction after which gap and speeds agree best; one that leaves half of the change over
+    # explains nothing.
+    explanation, least_left_over = problem.words, 0.5
     for words, (gaps, ahead, behind) in corrected.items():
-        after = agreement(gaps, ahead - behind, pair.dt)
-        if after.left < least and not rule.breaks_slope(after):
-            best, least = words, after.left
-    return replace(problem, signals="gap and speeds", quantity="gap", slope=slope, words=best)
+        agreement = measured_agreement(gaps, ahead - behind, pair.dt)
+        if agreement.left_over < least_left_over and not _RULES["gap"].breaks_slope(agreement):
+            explanation, least_left_over = words, agreement.left_over
+    return replace(
+        problem, signals="gap and speeds", quantity="gap", slope=slope, words=explanation
+    )
 
 
 def _units_of(who: str, units: Units) -> dict[str, str]:
@@ -552,7 +595,7 @@ def _units_of(who: str, units: Units) -> dict[str, str]:
 def _factors(
     read_in: Units, faster: Sequence[str] = (), slower: Sequence[str] = ()
 ) -> dict[float, str]:
-    """Returns what slopes say of units: the slope, and the unit that a quantity seems to have.
+    """Returns what each slope would mean: a quantity that is in another unit than it is read in.
 
     Args:
         read_in: the unit in which each quantity was read.
@@ -587,25 +630,25 @@ def contradictions(
 
 
 def typical_contradiction(pairs: PairSet) -> Contradiction | None:
-    """Returns what contradicts what over all pairs together; None if nothing does.
+    """Returns a contradiction that only all pairs together show; None if there is none.
 
     Pairs in time steps of their own are compared too: a slope has no unit.
     """
     slopes: dict[tuple[str, str], list[float]] = {}
-    left: dict[tuple[str, str], list[float]] = {}
+    left_over: dict[tuple[str, str], list[float]] = {}
     missed: dict[tuple[str, str], list[float]] = {}
     for pair in pairs:
         relations = (*_relations(pair, "leader"), *_relations(pair, "follower"))
         for relation in (*relations, _gap_relation(pair)):
             key = relation.signals, relation.quantity
-            agreed, rule = relation.measured(), _RULES[relation.quantity]
-            if rule.tells(agreed):
-                left.setdefault(key, []).append(agreed.left)
+            agreement, rule = relation.measured(), _RULES[relation.quantity]
+            if rule.can_judge(agreement):
+                left_over.setdefault(key, []).append(agreement.left_over)
             if relation.quantity == "position":
-                agreed, rule = relation.measured(whole=True), _WHOLE
-            if agreed.spread >= rule.spread and agreed.slope > 0:
-                slopes.setdefault(key, []).append(math.log(agreed.slope))
-                missed.setdefault(key, []).append(agreed.missed)
+                agreement, rule = relation.measured(whole=True), _WHOLE
+            if agreement.spread >= rule.spread and agreement.slope > 0:
+                slopes.setdefault(key, []).append(math.log(agreement.slope))
+                missed.setdefault(key, []).append(agreement.missed)
     for key, logs in slopes.items():
         median, room = _median(logs)
         # Where a rate is smooth, what its integral misses goes with the signal and changes the
@@ -613,9 +656,9 @@ def typical_contradiction(pairs: PairSet) -> Contradiction | None:
         room += float(np.median(missed[key]))
         if len(logs) >= _FEW_PAIRS and abs(median) > _TYPICAL + room:
             return Contradiction(*key, math.exp(median), "", 1.0)
-    for key, shares in left.items():
+    for key, shares in left_over.items():
         share, room = _median(shares)
-        if len(shares) >= _FEW_PAIRS and share > _RULES[key[1]].typically_left + room:
+        if len(shares) >= _FEW_PAIRS and share > _RULES[key[1]].max_typical_left_over + room:
             words = (
                 f"over {_WINDOW_S:g} s the one changes otherwise than the other says, typically by"
                 f" {share:.0%} of the change: are they of the same time?"
@@ -632,7 +675,7 @@ def _median(values: Sequence[float]) -> tuple[float, float]:
     than one in a thousand is refused.
     """
     median = float(np.median(values))
-    away = np.abs(np.array(values) - median)
+    deviations = np.abs(np.array(values) - median)
     if len(values) < _MANY_PAIRS:
-        return median, 2.0 * float(away.max())
-    return median, 6.0 * float(np.median(away)) / math.sqrt(len(values))
+        return median, 2.0 * float(deviations.max())
+    return median, 6.0 * float(np.median(deviations)) / math.sqrt(len(values))

@@ -70,7 +70,7 @@ def with_names(pairs: PairSet, site: SiteNames, vehicle: str | None) -> PairSet:
     Raises:
         DataError: a pattern does not fit.
     """
-    if site is None and vehicle is None and len({pair.site for pair in pairs}) > 1:
+    if site is None and vehicle is None and len(set(pairs.sites)) > 1:
         return with_known_sites(pairs)
     return with_vehicles(with_sites(pairs, site), vehicle)
 

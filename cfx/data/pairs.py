@@ -344,6 +344,11 @@ class PairSet(Sequence[Pair]):
         """The driver of each pair: several pairs may have the same."""
         return [pair.driver for pair in self.pairs]
 
+    @property
+    def sites(self) -> list[str]:
+        """The road or area of each pair; "" where it is not known."""
+        return [pair.site for pair in self.pairs]
+
     def __len__(self) -> int:
         return len(self.pairs)
 
@@ -400,20 +405,23 @@ class PairSet(Sequence[Pair]):
             size += len(pair) * (len(RECORDED) + len(pair.truth) + len(pair.surroundings))
         free = memory.in_file((size,))
 
-        def kept(array: Array) -> Array:
+        def stored(array: Array) -> Array:
             nonlocal free
-            row, free = free[: len(array)], free[len(array) :]
-            row[:] = array
-            return row
+            copy, free = free[: len(array)], free[len(array) :]
+            copy[:] = array
+            return copy
 
-        stored = []
+        pairs = []
         for pair in self:
-            stored.append(pair.with_arrays(kept))
-        return replace(self, pairs=tuple(stored))
+            pairs.append(pair.with_arrays(stored))
+        return replace(self, pairs=tuple(pairs))
 
     def take(self, numbers: Sequence[int]) -> PairSet:
         """Returns the pairs at these places; nothing is counted as left out."""
-        return replace(self, pairs=tuple([self.pairs[number] for number in numbers]))
+        pairs = []
+        for number in numbers:
+            pairs.append(self.pairs[number])
+        return replace(self, pairs=tuple(pairs))
 
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:
         """Keeps the pairs marked True and counts the others under `reason`."""

@@ -30,6 +30,7 @@ _MANY = 4
 """Pairs that say what is typical."""
 
 _FROZEN_S = 1.0
+"""A signal that stays the same for this long while its rate says otherwise is frozen, s."""
 
 
 def doubts(pairs: PairSet) -> Iterator[str]:
@@ -60,18 +61,20 @@ def doubts(pairs: PairSet) -> Iterator[str]:
             f"vehicles that stand are typically {np.median(gaps):.1f} m behind their leaders: are"
             " gaps from bumper to bumper, not from front to front or centre to centre?"
         )
-    typical_gaps = np.array([float(np.median(pair.gap)) for pair in pairs])
-    far = np.count_nonzero(typical_gaps > _FAR_M)
-    if far:
-        worst, most = pairs[int(np.argmax(typical_gaps))].pair_id, float(typical_gaps.max())
+    typical_gaps = np.array(list(map(np.median, of_each(pairs, "gap"))))
+    far_apart = np.count_nonzero(typical_gaps > _FAR_M)
+    if far_apart:
+        farthest = int(np.argmax(typical_gaps))
         yield (
-            f"{far} of {len(pairs)} pairs are typically more than {_FAR_M:g} m apart ('{worst}':"
-            f" {most:,.0f} m): is the leader the vehicle ahead, are positions in one unit?"
+            f"{far_apart} of {len(pairs)} pairs are typically more than {_FAR_M:g} m apart"
+            f" ('{pairs[farthest].pair_id}': {typical_gaps[farthest]:,.0f} m): is the leader the"
+            " vehicle ahead, are positions in one unit?"
         )
-    alike = twins(pairs)
-    if alike:
-        original, copy = alike[0]
-        copies = {later for _, later in alike}
+    originals_and_copies = twins(pairs)
+    if originals_and_copies:
+        original, copy = originals_and_copies[0]
+        _, all_copies = zip(*originals_and_copies, strict=True)
+        copies = set(all_copies)  # a copy of several pairs counts once
         yield (
             f"{len(copies)} of {len(pairs)} pairs drive as another one does, to 0.1 m and m/s"
             f" ('{copy}' as '{original}'): leave copies out, or who is learned from is tested too"
@@ -87,8 +90,11 @@ def rare(pairs: PairSet) -> Iterator[str]:
             yield f"{counted}: {advice}"
     backwards = list(_counted(pairs, "steps in which a vehicle moves backwards", _goes_back))
     for counted in backwards:
-        backing = [pair for pair in pairs if _goes_back(pair).any()]
-        if all(follows_from_gaps(pair) for pair in backing):
+        backing = []
+        for pair in pairs:
+            if _goes_back(pair).any():
+                backing.append(pair)
+        if all(map(follows_from_gaps, backing)):
             yield (
                 f"{counted}: positions follow from the leader's speed and the gap here, so this is"
                 " the noise of the gap while vehicles stand or creep, and no contradiction; use it"
@@ -102,11 +108,15 @@ def rare(pairs: PairSet) -> Iterator[str]:
 
 
 def _goes_back(pair: Pair) -> Marks:
+    """Marks steps in which the follower moves backwards, `(T - 1,)`."""
     return np.diff(pair.follower_position) < 0
 
 
 def _jumps(pair: Pair) -> Marks:
-    room = 1.0 + pair.dt**2  # m: a speed that changes within a step
+    """Marks steps in which a position moves otherwise than its speeds allow, `(T - 1,)`."""
+    # A speed that rises at 4 m/s2 and falls again within the step moves a vehicle by
+    # 4 (dt / 2)^2 = dt^2 m beyond what the speeds at both ends say; 1 m is left for noise.
+    room = 1.0 + pair.dt**2
     jumps = np.zeros(len(pair) - 1, dtype=bool)
     for who in ("leader", "follower"):
         position, speed = getattr(pair, f"{who}_position"), getattr(pair, f"{who}_speed")
@@ -115,10 +125,11 @@ def _jumps(pair: Pair) -> Marks:
 
 
 def _speed_jumps(pair: Pair) -> Marks:
-    most = 2.0 + 8.0 * pair.dt
-    return (np.abs(np.diff(pair.leader_speed)) > most) | (
-        np.abs(np.diff(pair.follower_speed)) > most
-    )
+    """Marks steps in which a speed changes by more than full braking, `(T - 1,)`."""
+    # Full braking is 8 m/s2 on a dry road; 2 m/s are left for noise.
+    largest_change = 2.0 + 8.0 * pair.dt
+    leader_jumps = np.abs(np.diff(pair.leader_speed)) > largest_change
+    return leader_jumps | (np.abs(np.diff(pair.follower_speed)) > largest_change)
 
 
 def _is_frozen(pair: Pair) -> Marks:
@@ -127,11 +138,12 @@ def _is_frozen(pair: Pair) -> Marks:
     run = max(2, round(_FROZEN_S / pair.dt))
     for who in ("leader", "follower"):
         for name, rate, least in (("position", "speed", 1.0), ("speed", "acceleration", 0.3)):
-            same = np.diff(getattr(pair, f"{who}_{name}")) == 0
-            same &= np.abs(getattr(pair, f"{who}_{rate}")[1:]) > least
-            if len(same) >= run:
-                full = np.convolve(same, np.ones(run), mode="valid") == run
-                frozen |= np.convolve(full, np.ones(run), mode="full") > 0
+            is_frozen = np.diff(getattr(pair, f"{who}_{name}")) == 0
+            is_frozen &= np.abs(getattr(pair, f"{who}_{rate}")[1:]) > least
+            if len(is_frozen) >= run:
+                # Where a run of that many frozen steps begins; then all of its steps.
+                begins = np.convolve(is_frozen, np.ones(run), mode="valid") == run
+                frozen |= np.convolve(begins, np.ones(run), mode="full") > 0
     return frozen
 
 
@@ -161,7 +173,9 @@ _RARE: Mapping[str, tuple[Callable[[Pair], Marks], str]] = {
 
 def _counted(pairs: PairSet, what: str, wrong: Callable[[Pair], Marks]) -> Iterator[str]:
     """Yields how many frames are wrong and where most of them are; nothing if none is."""
-    counts = [int(np.count_nonzero(wrong(pair))) for pair in pairs]
+    counts = []
+    for pair in pairs:
+        counts.append(int(np.count_nonzero(wrong(pair))))
     if any(counts):
         worst = pairs[int(np.argmax(counts))].pair_id
         yield (

@@ -82,48 +82,47 @@ class Signal:
         return stored
 
 
-SIGNALS: dict[str, Signal] = {
-    signal.name: signal
-    for signal in (
-        Signal(
-            "leader_position", "m", "the leader's front bumper", "leader_position_m", "position"
-        ),
-        Signal("leader_speed", "m/s", "the leader's speed", "leader_speed_mps", "speed", low=0),
-        Signal(
-            "leader_acceleration",
-            "m/s2",
-            "the leader's acceleration",
-            "leader_acceleration_mps2",
-            "acceleration",
-        ),
-        Signal(
-            "follower_position",
-            "m",
-            "the follower's front bumper",
-            "follower_position_m",
-            "position",
-            "follower",
-        ),
-        Signal(
-            "follower_speed",
-            "m/s",
-            "the follower's speed",
-            "follower_speed_mps",
-            "speed",
-            "follower",
-            low=0,
-        ),
-        Signal(
-            "follower_acceleration",
-            "m/s2",
-            "the follower's acceleration",
-            "follower_acceleration_mps2",
-            "acceleration",
-            "follower",
-        ),
-        Signal("gap", "m", "to the leader, bumper to bumper", "gap_m", "gap", "follower"),
-    )
-}
+def _by_name(*signals: Signal) -> dict[str, Signal]:
+    return {signal.name: signal for signal in signals}
+
+
+SIGNALS = _by_name(
+    Signal("leader_position", "m", "the leader's front bumper", "leader_position_m", "position"),
+    Signal("leader_speed", "m/s", "the leader's speed", "leader_speed_mps", "speed", low=0),
+    Signal(
+        "leader_acceleration",
+        "m/s2",
+        "the leader's acceleration",
+        "leader_acceleration_mps2",
+        "acceleration",
+    ),
+    Signal(
+        "follower_position",
+        "m",
+        "the follower's front bumper",
+        "follower_position_m",
+        "position",
+        "follower",
+    ),
+    Signal(
+        "follower_speed",
+        "m/s",
+        "the follower's speed",
+        "follower_speed_mps",
+        "speed",
+        "follower",
+        low=0,
+    ),
+    Signal(
+        "follower_acceleration",
+        "m/s2",
+        "the follower's acceleration",
+        "follower_acceleration_mps2",
+        "acceleration",
+        "follower",
+    ),
+    Signal("gap", "m", "to the leader, bumper to bumper", "gap_m", "gap", "follower"),
+)
 """The signals of every recording, by name."""
 
 RECORDED = tuple(name for name in SIGNALS if name != "gap")

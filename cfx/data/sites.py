@@ -109,15 +109,15 @@ def with_vehicles(pairs: PairSet, pattern: str | None) -> PairSet:
         return pairs
     expression = re.compile(pattern)
     named = []
-    fits = False
+    fits_any = False
     for pair in pairs:
         match = expression.search(pair.follower_id)
-        fits |= match is not None
+        fits_any |= match is not None
         if match is None:
             named.append(pair)
         else:
             named.append(replace(pair, vehicle=match[1]))
-    if not fits and len(pairs):
+    if not fits_any and len(pairs):
         ids = {pair.follower_id for pair in pairs}
         raise DataError(
             f"data.vehicle={pattern} fits no follower's id of {pairs.source}; ids there:"

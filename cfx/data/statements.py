@@ -71,7 +71,7 @@ class Statement(NamedTuple):
 
 
 def remarks_of(statements: Iterable[Statement]) -> tuple[Remark, ...]:
-    """Returns what is to be said of columns that do not agree with others."""
+    """Returns a remark on each column that does not agree with the others."""
     remarks = []
     for statement in statements:
         remark = _remark_of(statement)
@@ -95,7 +95,7 @@ class _Comparison(NamedTuple):
 
 
 def _remark_of(statement: Statement) -> Remark | None:
-    """Returns what is to be said of a column; None if it agrees or says nothing."""
+    """Returns a remark on a column; None if it agrees with the others, or too few rows compare."""
     comparisons = []
     for follows in statement.follows:
         comparison = _compared(statement.said, follows, statement.resolution)

@@ -150,20 +150,21 @@ def relation_of(
     _, driver = np.unique(np.asarray(drivers), return_inverse=True)
     shares = 1.0 / np.bincount(driver)[driver] if weight is None else weight
     rows: list[tuple[float, ...]] = []
-    for place in range(speeds.shape[1]):
-        measured = np.isfinite(speeds[:, place])
-        listed = len(np.unique(driver[measured]))
-        if listed < max(1, least):
+    for speed_range in range(speeds.shape[1]):
+        measured = np.isfinite(speeds[:, speed_range])
+        count_of_drivers = len(np.unique(driver[measured]))
+        if count_of_drivers < max(1, least):
             continue
-        mean_speed = float(np.average(speeds[measured, place], weights=shares[measured]))
-        headway = (gaps[measured, place] + VEHICLE_M) / speeds[measured, place]
+        speeds_there, gaps_there = speeds[measured, speed_range], gaps[measured, speed_range]
+        mean_speed = float(np.average(speeds_there, weights=shares[measured]))
+        headway = (gaps_there + VEHICLE_M) / speeds_there
         quartiles = np.quantile(
             headway, (0.25, 0.5, 0.75), method="inverted_cdf", weights=shares[measured]
         )
         mean = float(np.average(headway, weights=shares[measured]))
         # A lane's flow is 1 / (mean time headway), which no mean of gaps would give.
-        gaps_there = np.array([mean, *quartiles]) * mean_speed - VEHICLE_M
-        rows.append((mean_speed, *gaps_there.tolist(), listed))
+        gaps_of_headways = np.array([mean, *quartiles]) * mean_speed - VEHICLE_M
+        rows.append((mean_speed, *gaps_of_headways.tolist(), count_of_drivers))
     speed, gap, low, median, high, count = np.array(rows, dtype=np.float64).reshape(-1, 6).T
     return GapRelation(speed, gap, low, median, high, count.astype(np.int64))
 
@@ -175,19 +176,16 @@ def relations_of_types(pairs: PairSet) -> dict[str, GapRelation]:
         pairs: recordings of people, of cars with adaptive cruise control, or of both; a type has
             the name that they give it, "" where they say nothing.
     """
-    from cfx.data.pairs import PairBatch
+    from cfx.data.pairs import PairBatch, of_each
 
     following = steady_following(PairBatch.of(pairs))
-    drivers = pairs.drivers
+    drivers = np.array(pairs.drivers, dtype=object)
+    types = np.array(of_each(pairs, "driver_type"), dtype=object)
     relations = {}
-    for kind in sorted({pair.driver_type for pair in pairs}):
-        rows, names = [], []
-        for number, pair in enumerate(pairs):
-            if pair.driver_type == kind:
-                rows.append(number)
-                names.append(drivers[number])
-        of_kind = SteadyFollowing(*(values[rows] for values in following))
-        relations[kind] = relation_of(of_kind, names)
+    for driver_type in np.unique(types).tolist():
+        rows = np.flatnonzero(types == driver_type)
+        of_type = SteadyFollowing(*(values[rows] for values in following))
+        relations[driver_type] = relation_of(of_type, drivers[rows].tolist())
     return relations
 
 

@@ -268,12 +268,15 @@ def with_positions(table: Table, order: Ints, starts: Ints) -> Table:
 
 
 def _lengths(numbers: dict[str, Floats], order: Ints, starts: Ints) -> Floats:
-    """Returns each pair's median of what its positions leave over beside the gap, `(N,)`."""
-    left = numbers["leader_position_m"] - numbers["follower_position_m"] - numbers[GAP]
-    result = np.empty_like(left)
+    """Returns the length of each row's leader, `(N,)`, m: the median over the rows of its pair.
+
+    It is what the distance of the front bumpers leaves over beside the gap.
+    """
+    lengths = numbers["leader_position_m"] - numbers["follower_position_m"] - numbers[GAP]
+    medians = np.empty_like(lengths)
     for rows in np.split(order, starts[1:]):
-        result[rows] = np.median(left[rows])
-    return result
+        medians[rows] = np.median(lengths[rows])
+    return medians
 
 
 def _by_pair(
@@ -283,7 +286,7 @@ def _by_pair(
     starts: Ints,
     steps: Floats,
 ) -> Floats:
-    """Returns what a function of values over time and a time step makes of each pair, `(N,)`."""
+    """Applies a function of values over time and a time step to each pair, `(N,)`."""
     result = np.empty_like(values)
     for rows, step in zip(np.split(order, starts[1:]), steps.tolist(), strict=True):
         result[rows] = function(values[rows], step)

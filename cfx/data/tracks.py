@@ -121,12 +121,12 @@ class Tracks:
 
     def take(self, index: NDArray[Any]) -> Self:
         """Returns the rows at an index or a mask."""
-        taken = {}
+        selected = {}
         for field in fields(self):
             value = getattr(self, field.name)
             if isinstance(value, np.ndarray):
-                taken[field.name] = value[index]
-        return replace(self, **taken)
+                selected[field.name] = value[index]
+        return replace(self, **selected)
 
     def name(self, vehicle: int) -> str:
         """Returns what a vehicle is called."""
@@ -397,11 +397,11 @@ def next_in_lane(tracks: Tracks) -> tuple[Ints, Marks]:
     has_row = np.zeros(len(tracks), dtype=bool)
     order = np.lexsort((tracks.position, tracks.lane, tracks.frame, tracks.recording))
     behind, front = order[:-1], order[1:]
-    same = tracks.recording[behind] == tracks.recording[front]
-    same &= tracks.frame[behind] == tracks.frame[front]
-    same &= tracks.lane[behind] == tracks.lane[front]
-    ahead[behind[same]] = front[same]
-    has_row[behind[same]] = True
+    is_same_lane = tracks.recording[behind] == tracks.recording[front]
+    is_same_lane &= tracks.frame[behind] == tracks.frame[front]
+    is_same_lane &= tracks.lane[behind] == tracks.lane[front]
+    ahead[behind[is_same_lane]] = front[is_same_lane]
+    has_row[behind[is_same_lane]] = True
     return ahead, has_row
 
 
@@ -431,21 +431,21 @@ def _ends(tracks: Tracks, facts: _Facts, last: Ints) -> dict[str, Marks]:
         & (tracks.recording[after] == tracks.recording[last])
         & (tracks.frame[after] == tracks.frame[last] + 1)
     )
-    old = tracks.leader[last]
-    at, old_goes_on = _rows_of(tracks, tracks.recording[last], old, tracks.frame[last] + 1)
-    new = tracks.leader[after]
-    has_new = (new != old) & (new != NOBODY)
+    leader = tracks.leader[last]
+    at, leader_goes_on = _rows_of(tracks, tracks.recording[last], leader, tracks.frame[last] + 1)
+    next_leader = tracks.leader[after]
+    has_next_leader = (next_leader != leader) & (next_leader != NOBODY)
     if tracks.gap is None:
         old_left = tracks.lane[at] != tracks.lane[last]
     else:
         # Lanes of different roads cannot be compared: a vehicle that cuts in comes nearer.
-        old_left = has_new & (facts.gap[after] >= facts.gap[last])
+        old_left = has_next_leader & (facts.gap[after] >= facts.gap[last])
     reasons = {
         "the follower's rows end or pause": ~goes_on,
         "the follower changed lane": tracks.lane[after] != tracks.lane[last],
-        "the leader's rows end or pause": ~old_goes_on,
+        "the leader's rows end or pause": ~leader_goes_on,
         "the leader changed lane": old_left,
-        "another vehicle cut in": has_new,
+        "another vehicle cut in": has_next_leader,
         "the leader fell behind its follower": facts.is_behind[after],
         f"the leader went farther than {facts.max_gap:g} m": facts.is_far[after],
         "the recording names no leader any more": np.ones(len(last), dtype=bool),
@@ -454,7 +454,7 @@ def _ends(tracks: Tracks, facts: _Facts, last: Ints) -> dict[str, Marks]:
 
 
 def first_that_holds(reasons: Mapping[str, Marks]) -> dict[str, Marks]:
-    """Returns the same reasons; each row has only the first that holds for it."""
+    """Returns the same reasons, where only the first that holds for a row is kept."""
     result = {}
     is_open: Marks | None = None
     for reason, holds in reasons.items():
@@ -523,18 +523,18 @@ def frames_apart(source: str, recording: Ints, vehicle: Ints, frame: Ints) -> tu
     steps = np.diff(frame)[~changes(recording, vehicle)[1:]]
     if not len(steps):
         return frame, 1
-    apart = int(np.median(steps))
-    if apart < 2 or np.count_nonzero(steps % apart) > _FEW_STEPS * len(steps):
+    step = int(np.median(steps))
+    if step < 2 or np.count_nonzero(steps % step) > _FEW_STEPS * len(steps):
         return frame, 1
     starts, sizes = runs(recording)
     first = np.repeat(frame[starts], sizes)
-    is_between = (frame - first) % apart != 0
+    is_between = (frame - first) % step != 0
     if np.count_nonzero(is_between) > _FEW_STEPS * len(frame):
         raise DataError(
-            f"{source}: each vehicle has a row at every {apart}th frame, but not all at the same"
+            f"{source}: each vehicle has a row at every {step}th frame, but not all at the same"
             " ones, so that nobody is seen together with their leader; keep the same frames of all"
         )
-    return frame // apart, apart
+    return frame // step, step
 
 
 def distance_driven(speed: Floats, dt: float) -> Floats:
@@ -549,8 +549,10 @@ def distance_driven(speed: Floats, dt: float) -> Floats:
 
 def follows_from_gaps(pair: Pair) -> bool:
     """Says whether positions follow from gaps and speeds, as where a file has none."""
-    left = pair.leader_position - pair.leader_length - distance_driven(pair.leader_speed, pair.dt)
-    return bool(np.abs(left).max() < 1e-6)
+    difference = (
+        pair.leader_position - pair.leader_length - distance_driven(pair.leader_speed, pair.dt)
+    )
+    return bool(np.abs(difference).max() < 1e-6)
 
 
 def accelerations(speed: Floats, dt: float) -> Floats:

@@ -29,6 +29,7 @@ _DESIRED = 0.9
 """Quantile of a vehicle's speeds in a lane that counts as its desired speed there."""
 
 _ACCELERATES_MPS2 = 0.1
+"""A driver whose mean acceleration over a second is smaller does not accelerate."""
 
 _HELD_UP = 0.25
 """Share of the moments at which slow drivers far behind a leader do not accelerate. It is 0 to 0.13
@@ -45,17 +46,20 @@ _QUESTION = (
 
 
 def remarks_on_leaders(tracks: Tracks) -> tuple[Remark, ...]:
-    """Returns what speaks against leaders that are the next vehicles in the lane.
+    """Returns signs that leaders, found as the next vehicle in the lane, are not the true ones.
 
     Args:
         tracks: rows whose leaders were found by place.
     """
     if not len(tracks):
         return ()
-    return tuple(Remark(f"{words}: {_QUESTION}") for words in _signs(tracks))
+    remarks = []
+    for sign in _signs_of_missing_vehicles(tracks):
+        remarks.append(Remark(f"{sign}: {_QUESTION}"))
+    return tuple(remarks)
 
 
-def _signs(tracks: Tracks) -> Iterator[str]:
+def _signs_of_missing_vehicles(tracks: Tracks) -> Iterator[str]:
     """Yields a sentence for each sign that vehicles are missing."""
     ahead, has_leader = rows_ahead(tracks)
     has_follower = np.zeros(len(tracks), dtype=bool)

@@ -345,9 +345,11 @@ def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
             agent = agent.only(used)
         if followers.base is not None:
             base = followers.base[part]
-        own = None if followers.own is None else followers.own[part]
-        some = Followers(followers.batch[part].trimmed(), network, base, followers.history, own)
-        yield ClosedLoopShard(whole.stepper, agent, some, whole.first[part])
+        own_parameters = None if followers.own is None else followers.own[part]
+        followers_of_shard = Followers(
+            followers.batch[part].trimmed(), network, base, followers.history, own_parameters
+        )
+        yield ClosedLoopShard(whole.stepper, agent, followers_of_shard, whole.first[part])
 
 
 class _Joined:

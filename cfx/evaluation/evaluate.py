@@ -19,7 +19,7 @@ from cfx.core import memory
 from cfx.core.distributions import OWN
 from cfx.core.parameters import ParameterSpace
 from cfx.core.registry import Installed
-from cfx.data.pairs import PairBatch, PairSet
+from cfx.data.pairs import PairBatch, PairSet, of_each
 from cfx.data.style import CLUSTERS, StyleResult
 from cfx.errors import in_words
 from cfx.evaluation.closed_loop import PAIRS_AT_ONCE, ClosedLoop
@@ -373,7 +373,7 @@ def _improvements(
 
 
 def _about(tested: ComparedPairs, measures: _Measures, names: Sequence[str]) -> pd.DataFrame:
-    """Returns `Evaluation.about`."""
+    """Returns a row per pair and method: who drives, the cluster and the mean parameters."""
     pairs = tested.pairs
     by_driver = tested.style.table.set_index("driver")
     methods = list(measures.parameters)
@@ -382,9 +382,9 @@ def _about(tested: ComparedPairs, measures: _Measures, names: Sequence[str]) -> 
     folds = np.zeros(len(pairs), np.int64) if tested.fold is None else tested.fold.numpy()
     of_pair = {
         "pair_id": pairs.ids,
-        "recording": [pair.recording for pair in pairs],
-        "leader_id": [pair.leader_id for pair in pairs],
-        "follower_id": [pair.follower_id for pair in pairs],
+        "recording": of_each(pairs, "recording"),
+        "leader_id": of_each(pairs, "leader_id"),
+        "follower_id": of_each(pairs, "follower_id"),
         "driver": drivers,
         "cluster": clusters.to_numpy(),
         "style_score": by_driver["score"].loc[drivers].to_numpy(dtype=np.float64),

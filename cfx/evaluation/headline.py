@@ -96,7 +96,7 @@ _CLOSE = 0.03
 
 
 def summaries_disagree(geometric: float, ratio_of_means: float) -> str:
-    """Returns what the mean errors say where they say something else than the improvement; or "".
+    """Returns the ratio of mean errors in words, where it disagrees with the improvement; or "".
 
     Each driver counts alike in a geometric mean. Drivers with large errors outweigh the others in a
     ratio of mean errors.
@@ -113,7 +113,7 @@ FEW_DRIVERS = 10
 
 
 def doubts(statistics: Mapping[str, float]) -> list[str]:
-    """Returns what is to be known beside an improvement, as parts of a sentence.
+    """Returns reasons to doubt an improvement: other mean errors, few drivers.
 
     Args:
         statistics: of the improvement, by name: those that are known.

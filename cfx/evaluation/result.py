@@ -332,5 +332,10 @@ class Evaluation:
 
 
 def _in_order(methods: pd.Series) -> tuple[str, ...]:
-    present = set(methods)
-    return tuple(method for method in METHODS if method in present)
+    """Returns the methods of a column, each once, in the order of `METHODS`."""
+    compared = set(methods.unique())
+    in_order = []
+    for method in METHODS:
+        if method in compared:
+            in_order.append(method)
+    return tuple(in_order)

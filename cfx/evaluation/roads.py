@@ -401,7 +401,7 @@ def simulate_roads(
 
 
 def _seen(follower: Follower, ahead: Leader) -> tuple[Tensor, ...]:
-    """Returns one frame of what drivers see, in the order of `OBSERVED`."""
+    """Returns one frame of the signals that drivers observe, in the order of `OBSERVED`."""
     gap = ahead.position - ahead.length - follower.position
     return ahead.speed, ahead.acceleration, follower.speed, follower.acceleration, gap
 
@@ -409,7 +409,7 @@ def _seen(follower: Follower, ahead: Leader) -> tuple[Tensor, ...]:
 def _kept_steady(
     moved: Follower, before: Follower, speed: Tensor, steady: Tensor, dt: float
 ) -> Follower:
-    """Returns vehicles after a step, of which some drive at speeds `(D,)` that they keep."""
+    """Returns vehicles after a step; those with a prescribed speed `(D,)` keep it."""
     return moved._replace(
         position=torch.where(steady, before.position + speed * dt, moved.position),
         speed=torch.where(steady, speed, moved.speed),

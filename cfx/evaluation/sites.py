@@ -50,14 +50,16 @@ def site_table(pairs: PairSet, evaluation: Evaluation) -> pd.DataFrame | None:
         if "policy" not in judged and scope != "test":
             continue
         about = labels.loc[judged.index]
+        rows_of_sites = []
         for site, of_site in about.groupby("site", sort=False):
-            rows.append(_row(scope, str(site), ALL_SITES, of_site, errors))
+            row = _row(scope, str(site), ALL_SITES, of_site, errors)
+            rows_of_sites.append(row)
+            rows.append(row)
             if len(set(of_site["driver_type"])) > 1:
                 for kind, of_kind in of_site.groupby("driver_type", sort=False):
                     name = str(kind) or "not known"
                     rows.append(_row(scope, str(site), name, of_kind, errors))
-        every = [row for row in rows if row["scope"] == scope and row["driver_type"] == ALL_SITES]
-        rows.append(_mean_of_sites(scope, every, about, judged))
+        rows.append(_mean_of_sites(scope, rows_of_sites, about, judged))
     return pd.DataFrame(rows)
 
 
@@ -79,7 +81,7 @@ def _row(
     about: pd.DataFrame,
     errors: Mapping[str, pd.DataFrame],
 ) -> dict[str, object]:
-    """Returns the row of some pairs of a site, of which `about` has the labels.
+    """Returns the row of some pairs of a site; `about` has their sites, drivers and types.
 
     The first of `errors` is the one by which the job is judged.
     """

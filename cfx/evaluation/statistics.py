@@ -167,7 +167,7 @@ def mean_interval(values: Sequence[float], drivers: Sequence[str]) -> tuple[floa
 
 
 def _numbered(drivers: Sequence[str] | None, counts: NDArray[np.bool_]) -> NDArray[np.intp]:
-    """Returns the number of the driver of each pair that counts."""
+    """Numbers the drivers of the pairs that count, and returns each pair's number."""
     if drivers is None:
         return np.arange(int(counts.sum()))
     return np.unique(np.asarray(drivers)[counts], return_inverse=True)[1]
@@ -352,9 +352,12 @@ def ranking_of(
     for other in ranked[1:]:
         key = ranked[0], other
         against.append(Against(*key, compared[key], corrected[key]))
-    apart = tuple(name for name in errors if name not in ranked)
+    not_comparable = []
+    for name in errors:
+        if name not in ranked:
+            not_comparable.append(name)
     mean_errors = tuple(means[name] for name in ranked)
-    return Ranking(tuple(ranked), mean_errors, len(tested), tuple(against), apart)
+    return Ranking(tuple(ranked), mean_errors, len(tested), tuple(against), tuple(not_comparable))
 
 
 def _mean_error(errors: pd.Series, drivers: Sequence[str], sites: Sequence[str] | None) -> float:

@@ -45,14 +45,15 @@ def long_table(
     groups: dict[tuple[str, str], dict[str, Floats]] = {}
     for (metric, scope, method), values in measured.items():
         groups.setdefault((metric, scope), {})[method] = values
-    metrics, scopes, methods = (list(dict.fromkeys(part)) for part in zip(*measured, strict=True))
+    keys = pd.MultiIndex.from_tuples(list(measured))
+    metrics, scopes, methods = (keys.unique(level).tolist() for level in range(3))
     names = {"pair_id": list(pair_ids), "method": methods, "scope": scopes, "metric": metrics}
     codes: dict[str, list[NDArray[Any]]] = {name: [] for name in names}
     value = []
     for (metric, scope), by_method in groups.items():
         # Pair by pair, the methods in turn: in its last bit pandas' mean over groups depends on the
         # order.
-        of_method = np.array([methods.index(one) for one in by_method], np.int8)
+        of_method = pd.Index(methods).get_indexer(pd.Index(list(by_method))).astype(np.int8)
         rows = len(pair_ids) * len(of_method)
         codes["pair_id"].append(np.arange(len(pair_ids), dtype=np.int32).repeat(len(of_method)))
         codes["method"].append(np.tile(of_method, len(pair_ids)))
@@ -69,7 +70,7 @@ def long_table(
 
 
 def _categories(codes: NDArray[Any], names: list[str]) -> Any:
-    """Returns a column of names, each a number in memory."""
+    """Returns a column of names; memory holds a small number for each."""
     return pd.Categorical.from_codes(codes, pd.Index(names))
 
 
@@ -120,7 +121,8 @@ def wide_table(
     Columns besides those of `about`: METRIC, `steady_METRIC`, `full_trajectory_METRIC` and, of the
     recorded driver, `real_METRIC`; `improvement_over_BASELINE`, of the metric `judge`.
     """
-    parameters = [name for name in about if str(name).startswith(("parameter_", FLAT_SHARE_PREFIX))]
+    is_parameter = about.columns.str.startswith(("parameter_", FLAT_SHARE_PREFIX))
+    parameters = about.columns[is_parameter]
     columns: dict[str, pd.Series] = {}
     for scope in SCOPES:
         for metric in metrics:

@@ -94,7 +94,10 @@ _DIP_FROM_MPS, _DIP_MPS2, _DIP_S = 15.0, 1.0, 5.0
 """Speed before the dip, how hard the leader changes speed, how long it stays slow."""
 
 _DIP_BEGINS_S, _DIP_LASTS_S = 300.0, 200.0
+"""How long the platoon settles before the dip, and how long vehicles are watched from then on."""
+
 _AVERAGED_S = 10.0
+"""Over so long speeds and gaps of settled vehicles are averaged, s."""
 
 _SUGIYAMA, _SUGIYAMA_M, _SUGIYAMA_S = 22, 230.0, 600.0
 _PERTURBATION = 0.1
@@ -172,12 +175,12 @@ class Measure(NamedTuple):
     def of(cls, name: str, value: float, step: float) -> Measure:
         """Returns a measure that `USUAL` has."""
         usual = USUAL[name]
-        word = ""
+        verdict = ""
         if value < usual.low:
-            word = usual.below
+            verdict = usual.below
         elif value > usual.high:
-            word = usual.above
-        return cls(name, value, step, usual.low, usual.high, word)
+            verdict = usual.above
+        return cls(name, value, step, usual.low, usual.high, verdict)
 
     @classmethod
     def of_flow(cls, speed: float, flows: Floats, recorded: float, step: float) -> Measure:
@@ -277,8 +280,8 @@ class RecordedFlows(NamedTuple):
         """Returns quantiles of drivers' time gaps as `DriverTraffic.time_gaps` has them."""
         speeds, columns = np.array(FLEET_SPEEDS_MPS), []
         for gap in (self.relation.low, self.relation.median, self.relation.high):
-            there = np.interp(speeds, self.relation.speed, gap, left=np.nan, right=np.nan)
-            columns.append(there / speeds)
+            gaps = np.interp(speeds, self.relation.speed, gap, left=np.nan, right=np.nan)
+            columns.append(gaps / speeds)
         return np.stack(columns, -1)
 
 
@@ -341,8 +344,8 @@ def driver_traffic(
     usual = np.full(len(SPEEDS_MPS), np.nan)
     if recorded is not None:
         usual = recorded.at(np.array(SPEEDS_MPS))
-    for speed, of_speed, there in zip(SPEEDS_MPS, flows, usual, strict=True):
-        measures.append(Measure.of_flow(speed, of_speed, float(there), step))
+    for speed, of_speed, usual_flow in zip(SPEEDS_MPS, flows, usual, strict=True):
+        measures.append(Measure.of_flow(speed, of_speed, float(usual_flow), step))
     differ = float(100.0 * (flows.max(1) / flows.min(1) - 1.0).max())
     measures.append(Measure.of("starts_differ", differ, step))
     measures.append(Measure.of("capacity", float(ring[:, 1].max()), step))

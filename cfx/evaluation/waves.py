@@ -94,22 +94,22 @@ def pair_waves(
     """
     lags = min(round(MOST_LAG_S / dt), position.shape[1] - 2)
     if lags < 2:
-        nothing = torch.full(position.shape[:1], torch.nan, dtype=torch.float64)
-        return PairWaves(nothing, nothing)
+        undefined = torch.full(position.shape[:1], torch.nan, dtype=torch.float64)
+        return PairWaves(undefined, undefined)
     correlations, moved = [], []
     for lag in range(lags + 1):
         before, after = slice(0, position.shape[1] - lag), slice(lag, None)
-        both = counted[:, before] & counted[:, after]
-        correlations.append(_correlation(leader_speed[:, before], speed[:, after], both))
-        moved.append(_mean(position[:, after] - leader_position[:, before], both))
-    correlation, way = torch.stack(correlations, -1).double(), torch.stack(moved, -1).double()
+        counts = counted[:, before] & counted[:, after]
+        correlations.append(_correlation(leader_speed[:, before], speed[:, after], counts))
+        moved.append(_mean(position[:, after] - leader_position[:, before], counts))
+    correlation, distances = torch.stack(correlations, -1).double(), torch.stack(moved, -1).double()
     best = correlation.nan_to_num(-1.0).argmax(-1)
     inner = best.clamp(1, lags - 1)
     top = inner + _peak(correlation, inner)
     low = top.floor().long().clamp(0, lags - 1)
     share = top - low
     rows = torch.arange(len(best), device=best.device)
-    travelled = (1.0 - share) * way[rows, low] + share * way[rows, low + 1]
+    travelled = (1.0 - share) * distances[rows, low] + share * distances[rows, low + 1]
     changes = _std(leader_speed, counted) >= LEAST_STD
     follows = (correlation[rows, best] >= _LEAST_CORRELATION) & (best == inner)
     measured = changes & follows
@@ -170,10 +170,10 @@ def ring_waves(position: Tensor, speed: Tensor, circumference: float, interval: 
 
 
 def _peak(values: Tensor, place: Tensor) -> Tensor:
-    """Returns how far from a place `(P,)` a parabola through three values `(P, n)` has its top."""
+    """Returns how far from a place `(P,)` a parabola through it and its neighbours has its top."""
     rows = torch.arange(len(place), device=place.device)
-    before, here, after = (values[rows, place + k] for k in (-1, 0, 1))
-    curvature = before - 2.0 * here + after
+    before, at_place, after = (values[rows, place + k] for k in (-1, 0, 1))
+    curvature = before - 2.0 * at_place + after
     top = 0.5 * (before - after) / torch.where(curvature < 0.0, curvature, -torch.inf)
     return top.clamp(-0.5, 0.5).nan_to_num(0.0)
 
@@ -187,9 +187,9 @@ def _std(values: Tensor, counted: Tensor) -> Tensor:
     return _mean(deviation.square(), counted).sqrt()
 
 
-def _correlation(one: Tensor, other: Tensor, counted: Tensor) -> Tensor:
+def _correlation(signal: Tensor, other: Tensor, counted: Tensor) -> Tensor:
     """Returns the correlation of two signals `(P, T)`, NaN where one does not change."""
-    first = one - _mean(one, counted)[:, None]
+    first = signal - _mean(signal, counted)[:, None]
     second = other - _mean(other, counted)[:, None]
     scale = (_mean(first.square(), counted) * _mean(second.square(), counted)).sqrt()
     return _mean(first * second, counted) / torch.where(scale > 0.0, scale, torch.nan)

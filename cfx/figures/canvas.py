@@ -241,8 +241,11 @@ def side_by_side(figure: Figure, widths: Sequence[float], **more: Any) -> list[A
 
 def _style() -> dict[str, Any]:
     """Returns Matplotlib's settings for the paper: its sizes are those of `_STYLE`, scaled."""
-    lengths = [key for key in _STYLE if key.endswith(("size", "width", "pad"))]  # in points
-    return {**_STYLE, **{key: points(_STYLE[key]) for key in lengths}}
+    style = dict(_STYLE)
+    for key, value in _STYLE.items():
+        if key.endswith(("size", "width", "pad")):  # in points
+            style[key] = points(value)
+    return style
 
 
 @contextmanager

@@ -75,7 +75,7 @@ class TrainingPairs:
 
     @property
     def known_drivers(self) -> tuple[str, ...]:
-        """Whose pair each is; each is another driver's where none is named."""
+        """The driver of each pair; where none is named, each pair is a driver of its own."""
         return self.drivers or tuple(str(number) for number in range(len(self)))
 
 
@@ -188,12 +188,12 @@ class Learner(Component):
         """
         if not self.needs_gradients or (differentiable and model.differentiable):
             return
-        which = "the simulator"
+        component = "the simulator"
         if differentiable:
-            which = "the driving model"
+            component = "the driving model"
         raise ConfigError(
-            f"this learner needs gradients, and {which} has none; choose a differentiable model and"
-            " simulator=memory, or learner=imitation"
+            f"this learner needs gradients, and {component} has none; choose a differentiable model"
+            " and simulator=memory, or learner=imitation"
         )
 
     def require_no_driver_features(self, policy: Policy) -> None:

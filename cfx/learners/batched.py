@@ -153,7 +153,7 @@ class BatchedModule(pl.LightningModule):
         self.on_epoch()
 
     def forget_best(self) -> None:
-        """Lets no epoch before this one be the best: from here on losses mean something else."""
+        """Forgets the best epoch so far: later losses are of something else, and do not compare."""
         self.best_loss = torch.full_like(self.best_loss, torch.inf)
 
     def restore_best(self) -> None:

@@ -317,23 +317,23 @@ class WithResidual(Composed):
         proposed = self.inner.next_speed(self.inside(follower), leader, p, dt)
         alone = (proposed - follower.speed) / dt
         share = -torch.expm1(-(follower.memory[..., _PASSED] / p[HANDOVER.name]).square())
-        held = self._remembered(follower, _HELD, follower.acceleration)
-        both = (1.0 - share) * held + share * alone
-        both = both + safe_sqrt(share) * _residual_at(follower)
-        braked = _braked(both, alone, follower, leader)
+        held_acceleration = self._remembered(follower, _HELD, follower.acceleration)
+        mixed = (1.0 - share) * held_acceleration + share * alone
+        mixed = mixed + safe_sqrt(share) * _residual_at(follower)
+        braked = _braked(mixed, alone, follower, leader)
         return (follower.speed + dt * braked).clamp(min=0.0)
 
     def next_memory(
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float, speed: Tensor
     ) -> Tensor:
         jerk = self._remembered(follower, _JERK, p[JERK.name]) * torch.exp(-dt / p[JERK_TIME.name])
-        held = self._remembered(follower, _HELD, follower.acceleration) + jerk * dt
+        held_acceleration = self._remembered(follower, _HELD, follower.acceleration) + jerk * dt
         target = p[TARGET.name]
         share = torch.exp(-dt / p[RELAXATION_TIME.name])
         residual = target + (follower.memory[..., _RESIDUAL] - target) * share
         passed = follower.memory[..., _PASSED] + dt
         inner = super().next_memory(follower, leader, p, dt, speed)
-        own_memory = torch.stack([held, jerk, residual, passed], -1)
+        own_memory = torch.stack([held_acceleration, jerk, residual, passed], -1)
         return torch.cat([inner, own_memory], -1)
 
     def _remembered(self, follower: Follower, column: int, at_start: Tensor) -> Tensor:
@@ -354,14 +354,14 @@ def _residual_at(follower: Follower) -> Tensor:
     return residual.clamp(min=0.0) + weight * residual.clamp(max=0.0)
 
 
-def _braked(both: Tensor, alone: Tensor, follower: Follower, leader: Leader) -> Tensor:
+def _braked(mixed: Tensor, alone: Tensor, follower: Follower, leader: Leader) -> Tensor:
     """Returns `both`, that of model and residual, with all braking that is needed, m/s2."""
     gap = bumper_gap(follower, leader)
     closing = (follower.speed - leader.speed).clamp(min=0.0)
     needed = closing.square() / (2.0 * gap.clamp(min=_NEAR_M))
     most = torch.maximum(alone, -needed)
-    bounded = torch.where(needed > _HARD, torch.minimum(both, most), both)
-    return torch.where(gap < _TIGHT_M, torch.minimum(both, alone), bounded)
+    bounded = torch.where(needed > _HARD, torch.minimum(mixed, most), mixed)
+    return torch.where(gap < _TIGHT_M, torch.minimum(mixed, alone), bounded)
 
 
 SPEED_LIMIT = "speed_limit"

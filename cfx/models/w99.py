@@ -220,12 +220,14 @@ class W99(DrivingModel):
         # doubles are joined as integers).
         near_by = partial(where_below, scale=SPACING_WIDTH, temperature=self.temperature)
         slower = partial(where_below, scale=SPEED_WIDTH, temperature=self.temperature)
-        rest = slower(dv, opening_threshold, near_by(dx, far, following, free), free)
-        rest = slower(dv, closing_threshold, near_by(dx, perceived, approaching, rest), rest)
-        too_near = where_up_to(
-            dx, near, too_close, rest, scale=SPACING_WIDTH, temperature=self.temperature
+        otherwise = slower(dv, opening_threshold, near_by(dx, far, following, free), free)
+        otherwise = slower(
+            dv, closing_threshold, near_by(dx, perceived, approaching, otherwise), otherwise
         )
-        acceleration = slower(dv, opening_threshold, too_near, rest)
+        too_near = where_up_to(
+            dx, near, too_close, otherwise, scale=SPACING_WIDTH, temperature=self.temperature
+        )
+        acceleration = slower(dv, opening_threshold, too_near, otherwise)
         proposed = v + acceleration * dt
         return sumo_speed(
             v,

@@ -33,6 +33,7 @@ from cfx.policies.valid_range import RANGE_SIGNALS, ValidRange
 from cfx.simulation.windows import WindowSettings
 
 _FORMAT = 3
+"""Of `policy.json`; it is raised when files of before can no longer be read, which are refused."""
 
 _DESCRIPTION = "policy.json"
 _TENSORS = "policy.safetensors"

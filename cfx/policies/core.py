@@ -22,6 +22,7 @@ ANY_DRIVER = "all"
 """Name of the network that is for any driver."""
 
 _EDGE = 1e-6
+"""How near to 0 and 1, whose logits are infinite, answers count before their median is taken."""
 
 
 class Ensemble(PolicyNetwork):

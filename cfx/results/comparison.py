@@ -33,8 +33,21 @@ def common_judge(jobs: Iterable[tuple[MetricInfo, str]]) -> MetricInfo:
     Args:
         jobs: of each the error by which it is judged, and what `objective_of` says of it.
     """
-    judges = {objective: judge for judge, objective in jobs}
-    return next(iter(judges.values())) if len(judges) == 1 else RMSE_SPEED
+    judges = _judges(jobs)
+    if len(judges) != 1:
+        return RMSE_SPEED
+    (judge,) = judges.values()
+    return judge
+
+
+def minimised_the_same(jobs: Iterable[tuple[MetricInfo, str]]) -> bool:
+    """Says whether no two jobs minimised different errors; `jobs` as of `common_judge`."""
+    return len(_judges(jobs)) <= 1
+
+
+def _judges(jobs: Iterable[tuple[MetricInfo, str]]) -> dict[str, MetricInfo]:
+    """Returns each different objective of jobs, with the error that it is judged by."""
+    return {objective: judge for judge, objective in jobs}
 
 
 @dataclass(frozen=True, repr=False)
@@ -67,8 +80,7 @@ class Comparison:
         errors: dict[str, list[pd.DataFrame]] = {}
         for name, alike in jobs.items():
             errors[name] = [job.errors_by(judge.name) for job in alike]
-        same = len({objective for _, objective in objectives}) == 1
-        return cls(judge, ranking_of(errors), same)
+        return cls(judge, ranking_of(errors), minimised_the_same(objectives))
 
     @property
     def table(self) -> pd.DataFrame:

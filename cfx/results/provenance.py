@@ -162,15 +162,19 @@ def flatten(config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def _leaves(value: Any, path: str) -> Iterable[tuple[str, Any]]:
+    """Yields path and value of all that is no mapping, nor a list that holds mappings or lists.
+
+    Empty mappings are values, too.
+    """
     items: Iterable[tuple[Any, Any]] = ()
     if isinstance(value, Mapping):
         items = value.items()
-    elif isinstance(value, list | tuple) and any(_is_nested(part) for part in value):
+    elif isinstance(value, list | tuple) and any(map(_is_nested, value)):
         items = enumerate(value)
     if not items:
         yield path, value
-    for key, part in items:
-        yield from _leaves(part, f"{path}.{key}" if path else str(key))
+    for key, item in items:
+        yield from _leaves(item, f"{path}.{key}" if path else str(key))
 
 
 def _is_nested(value: Any) -> bool:

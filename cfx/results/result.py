@@ -133,14 +133,14 @@ class Result:
             metrics: None: those of the evaluation alone.
             trained: the policy that drove.
         """
-        held = {"pairs": evaluation.table, **evaluation.tables}
+        measured = {"pairs": evaluation.table, **evaluation.tables}
         if evaluation.style is not None:
-            held["style"] = evaluation.style.table
+            measured["style"] = evaluation.style.table
         return cls(
             config=config or {},
             data={**(data or {}), **description_of(evaluation)},
             metrics=evaluation.metrics() if metrics is None else metrics,
-            tables={**held, **(tables or {})},
+            tables={**measured, **(tables or {})},
             measured=evaluation,
             trained=trained,
         )
@@ -280,9 +280,12 @@ class Result:
         """The methods that were compared, in the order in which they are shown."""
         if "method" not in self.pairs:
             return ()
-        present = self.pairs["method"].astype(str).unique().tolist()
-        ordered = [method for method in METHODS if method in present]
-        return (*ordered, *(method for method in present if method not in METHODS))
+        compared = self.pairs["method"].astype(str).unique().tolist()
+        methods = []
+        for method in dict.fromkeys((*METHODS, *compared)):  # cfx's own first, each once
+            if method in compared:
+                methods.append(method)
+        return tuple(methods)
 
     @property
     def shown_methods(self) -> tuple[str, ...]:
@@ -293,8 +296,13 @@ class Result:
         """
         if self.purpose is Purpose.POLICY:
             return ("policy",)
-        constant = tuple(method for method in self.methods if method != "policy")
-        return constant if self.purpose is Purpose.CALIBRATION and constant else self.methods
+        constant = []
+        for method in self.methods:
+            if method != "policy":
+                constant.append(method)
+        if self.purpose is Purpose.CALIBRATION and constant:
+            return tuple(constant)
+        return self.methods
 
     @property
     def judged(self) -> str:
@@ -346,10 +354,11 @@ class Result:
     @cached_property
     def known_metrics(self) -> tuple[MetricInfo, ...]:
         """What the job measured, in the order in which it is shown."""
-        metrics = known_metrics(self.data, self.metrics)
-        if self.purpose is Purpose.CALIBRATION:
-            return tuple(metric for metric in metrics if metric.name != OUTSIDE)
-        return metrics
+        metrics = []
+        for metric in known_metrics(self.data, self.metrics):
+            if metric.name != OUTSIDE or self.purpose is not Purpose.CALIBRATION:
+                metrics.append(metric)
+        return tuple(metrics)
 
     @cached_property
     def _summaries(self) -> dict[tuple[str, str, str], float]:
@@ -357,10 +366,10 @@ class Result:
         summaries: dict[tuple[str, str, str], float] = {}
         if "pair_metrics" not in self.tables:
             return summaries
-        kinds = {metric.name: metric.summary for metric in self.known_metrics}
+        how = {metric.name: metric.summary for metric in self.known_metrics}
         for key, rows in self.tables["pair_metrics"].groupby(["metric", "method", "scope"]):
             name, method, scope = map(str, key)
-            summary = rows["value"].dropna().agg(kinds.get(name, "mean"))
+            summary = rows["value"].dropna().agg(how.get(name, "mean"))
             summaries[name, method, scope] = float(summary)
         return summaries
 
@@ -544,9 +553,9 @@ class Result:
         pairs = self.evaluation.recorded
         assert pairs is not None
         demo = cast("Demo", registry.create("demo", config.demo))
-        own_folder = folder / config.demo["name"]
-        own_folder.mkdir(parents=True, exist_ok=True)
-        return tuple(demo.write(own_folder, pairs, self.policy, self.evaluation, config.protocol))
+        demo_folder = folder / config.demo["name"]
+        demo_folder.mkdir(parents=True, exist_ok=True)
+        return tuple(demo.write(demo_folder, pairs, self.policy, self.evaluation, config.protocol))
 
     def __repr__(self) -> str:
         """Returns two lines for people: what it is and how well it drives, and where it lies."""
@@ -619,16 +628,22 @@ def known_metrics(data: Mapping[str, Any], metrics: Mapping[str, float]) -> tupl
     declared = data.get("metrics")
     infos = []
     for values in declared if isinstance(declared, list) else []:
-        with suppress(ValidationError):  # what is no metric is none
+        with suppress(ValidationError):  # another version, or somebody's edit, left it out
             metric = _METRIC.validate_python(values)
-            scopes = []
-            for scope in metric.scopes:
-                prefix = key_of(metric.name, "", scope)
-                if any(key.startswith(prefix) for key in metrics):
-                    scopes.append(scope)
+            scopes = _measured_scopes(metric, metrics)
             if scopes and metric.summary in SUMMARIES:
-                infos.append(replace(metric, scopes=tuple(scopes)))
+                infos.append(replace(metric, scopes=scopes))
     return tuple(infos)
+
+
+def _measured_scopes(metric: MetricInfo, metrics: Mapping[str, float]) -> tuple[str, ...]:
+    """Returns the scopes of a metric in which `metrics` has it, of whichever method."""
+    scopes = []
+    for scope in metric.scopes:
+        prefix = key_of(metric.name, "", scope)
+        if any(key.startswith(prefix) for key in metrics):
+            scopes.append(scope)
+    return tuple(scopes)
 
 
 def judge_of(data: Mapping[str, Any], metrics: Mapping[str, float]) -> MetricInfo:
@@ -676,15 +691,13 @@ def _write_figures(folder: Path, result: Result, config: JobConfig) -> list[Path
     figures = []
     for figure in registry.chosen("figure", config.figures, distributions(config.model_dump())):
         is_named = config.figures == "all" or figure.name in config.figures
-        if is_named or figure.attempt(lambda drawn: drawn.is_usual(result), False):
+        if is_named or figure.attempt(lambda component: component.is_usual(result), False):
             figures.append(figure)
     paths = write_figures(folder, result, figures, formats=config.figure_formats)
-    drawn_names = {figure.name for figure in figures}
-    others = []
-    for figure in registry.installed("figure"):
-        if figure.name not in drawn_names:
-            others.append(figure.name)
-    if others and config.figures != "none":
+    not_drawn = dict.fromkeys(figure.name for figure in registry.installed("figure"))
+    for figure in figures:
+        not_drawn.pop(figure.name, None)
+    if not_drawn and config.figures != "none":
         words = "Not drawn (cfx figures JOB, figures=all or figures=[own,NAME] draw them): %s"
-        log.info(words, ", ".join(others), extra={"file_only": True})
+        log.info(words, ", ".join(not_drawn), extra={"file_only": True})
     return paths

@@ -142,8 +142,7 @@ class ResultTable(Component):
         Raises:
             DataError: the file cannot be read, or holds something else.
         """
-        texts = [column.name for column in self.columns if column.dtype == "text"]
-        whole = {column.name for column in self.columns if column.dtype == "int"}
+        texts, integers = self._columns_of("text"), self._columns_of("int")
         table = _load(path, texts)
         for column in self.columns:
             if column.required and not column.stands_for_several and column.name not in table:
@@ -152,7 +151,7 @@ class ResultTable(Component):
             if name in texts:
                 table[name] = table[name].astype(str).astype(object)
                 continue
-            if name in whole and table[name].dtype == np.int64:
+            if name in integers and table[name].dtype == np.int64:
                 continue
             try:
                 table[name] = table[name].astype(float)
@@ -162,6 +161,14 @@ class ResultTable(Component):
                     f" ({error})"
                 ) from error
         return table
+
+    def _columns_of(self, dtype: str) -> list[str]:
+        """Returns the names of the columns of a type."""
+        names = []
+        for column in self.columns:
+            if column.dtype == dtype:
+                names.append(column.name)
+        return names
 
 
 class Tables(Mapping[str, pd.DataFrame]):
@@ -206,11 +213,12 @@ def parts_of(
         PluginError: the rows lack a column that is declared.
     """
 
-    def begun(component: ResultTable) -> Iterator[pd.DataFrame] | None:
-        rows: Iterator[pd.DataFrame | None] = iter([evaluation.tables.get(table.name)])
-        if table.name not in evaluation.tables:
-            rows = iter(component.rows(evaluation))
-        parts = (part for part in rows if part is not None)
+    def begin(component: ResultTable) -> Iterator[pd.DataFrame] | None:
+        """Makes the first part, so that what a plugin does wrong is known before a file is made."""
+        if table.name in evaluation.tables:
+            parts = iter([evaluation.tables[table.name]])
+        else:
+            parts = _without_none(component.rows(evaluation))
         first = next(parts, None)
         if first is None:
             return None
@@ -219,7 +227,13 @@ def parts_of(
                 raise PluginError(f"it declares the column '{column.name}', its rows have none")
         return chain([first], parts)
 
-    return table.attempt(begun, None)
+    return table.attempt(begin, None)
+
+
+def _without_none(parts: Iterable[pd.DataFrame | None]) -> Iterator[pd.DataFrame]:
+    for part in parts:
+        if part is not None:
+            yield part
 
 
 def tables_of(
@@ -290,20 +304,22 @@ def stored_tables(folder: Path) -> Tables:
 def _load(path: Path, texts: list[str]) -> pd.DataFrame:
     # Most of pyarrow's and pandas' errors are ValueErrors or OSErrors.
     try:
-        needed = float(path.stat().st_size)
+        size = float(path.stat().st_size)
         if path.suffix == ".parquet":  # a short file may mean a long table, of 8 bytes a cell
-            about = pq.read_metadata(path)
-            needed = 8.0 * about.num_rows * about.num_columns
-        if needed > total_memory():
+            metadata = pq.read_metadata(path)
+            size = 8.0 * metadata.num_rows * metadata.num_columns
+        if size > total_memory():
             raise DataError(
-                f"{path} holds a table of {in_units(needed)}, more than this machine's memory; no"
+                f"{path} holds a table of {in_units(size)}, more than this machine's memory; no"
                 " job writes so much"
             )
         if path.suffix == ".parquet":
             return pd.read_parquet(path)
-        # An id such as "NA" is an id, and "007" is no number.
+        # An id such as "NA" is an id, and "007" is no number: only columns of numbers have cells
+        # that mean NaN.
         header = pd.read_csv(path, nrows=0)
-        empty = {str(column): ["", "nan"] for column in header if str(column) not in texts}
+        numbers = header.columns.astype(str).difference(texts)
+        empty = {name: ["", "nan"] for name in numbers}
         types: Any = dict.fromkeys(texts, str)
         return pd.read_csv(path, dtype=types, keep_default_na=False, na_values=empty)
     except (OSError, ValueError, ArithmeticError, pa.ArrowException) as error:

@@ -29,7 +29,7 @@ from cfx.calibration.settings import (
     are_reliable,
 )
 from cfx.core.parameters import Parameter
-from cfx.data.style import INDICATORS, style_distances, styles_by_site
+from cfx.data.style import INDICATOR_NAMES, INDICATORS, style_distances, styles_by_site
 from cfx.evaluation.metrics.base import MetricInfo
 from cfx.evaluation.result import METHODS, Evaluation
 from cfx.evaluation.sites import ALL_SITES, BASELINES
@@ -156,6 +156,14 @@ class Curves(ResultTable):
         return best_losses(evaluation.tables["curves"])
 
 
+def _indicator_columns(meaning: str, *, required: bool = True) -> list[Column]:
+    """Returns a column for each indicator of driving style."""
+    columns = []
+    for indicator in INDICATORS:
+        columns.append(Column(indicator.name, indicator.unit, meaning, required=required))
+    return columns
+
+
 class Style(ResultTable):
     """Driving style, a row per driver."""
 
@@ -168,7 +176,7 @@ class Style(ResultTable):
         Column("score", "1", "weighted sum of the indicators; large is aggressive"),
         Column("cluster", "1", "0, 1 or 2: conservative, normal, aggressive", "int"),
         Column("cluster_name", "", "the cluster by name", "text", required=False),
-        *(Column(one.name, one.unit, "an indicator", required=False) for one in INDICATORS),
+        *_indicator_columns("an indicator", required=False),
         Column("frames", "1", "frames of the driver", "int", required=False),
         Column("standing_frames", "1", "frames in which the driver stands", "int", required=False),
         Column("site", "", "the road or area; several are joined by `; `", "text", required=False),
@@ -274,7 +282,7 @@ def noise_evidence(tables: Mapping[str, pd.DataFrame]) -> dict[str, float]:
     if "noise" not in tables:
         return {}
     totals = tables["noise"].groupby("noise")["log_evidence"].sum()
-    return {str(kind): float(total) for kind, total in totals.items()}
+    return dict(zip(totals.index.astype(str), totals.astype(float), strict=True))
 
 
 @dataclass(frozen=True)
@@ -350,7 +358,7 @@ class KnownParameters:
         table.add_column("parameter")
         table.add_column("interval", justify="right")
         table.add_column("determined for", justify="right")
-        open_ones = []
+        undetermined = []
         for parameter in self.parameters:
             name = parameter.name
             columns = [f"median_{name}", f"low_{name}", f"high_{name}"]
@@ -360,11 +368,11 @@ class KnownParameters:
             determined = self.determined(name)
             table.add_row(name, interval, f"{determined} of {pairs}")
             if determined < self.reliable.sum():
-                open_ones.append(f"{name} for {self.reliable.sum() - determined}")
+                undetermined.append(f"{name} for {self.reliable.sum() - determined}")
         sentences = self._doubts()
-        if open_ones:
+        if undetermined:
             sentences.append(
-                f"Hardly known after these recordings: {', '.join(open_ones)} of {pairs} pairs"
+                f"Hardly known after these recordings: {', '.join(undetermined)} of {pairs} pairs"
                 f" (intervals less than {MIN_NARROWING:.0%} narrower than the prior's;"
                 " contraction_NAME in fits.parquet)."
             )
@@ -384,11 +392,14 @@ class KnownParameters:
         if "noise" in self.rows:
             name = str(self.rows["noise"].iloc[0])
             sentence = f"Noise: {_NOISE[name]} (calibration.noise={name})"
-            others = {kind: value for kind, value in self.evidence.items() if kind != name}
+            others = dict(self.evidence)
+            evidence = others.pop(name, math.nan)
             if others:
                 second = max(others, key=others.__getitem__)
-                ahead = self.evidence[name] - others[second]
-                sentence += f", the most evident kind; {second} comes next, {ahead:.0f} nats behind"
+                behind = evidence - others[second]
+                sentence += (
+                    f", the most evident kind; {second} comes next, {behind:.0f} nats behind"
+                )
             sentences.append(f"{sentence}.")
         if "likelihood_power" in self.rows:
             power = float(self.rows["likelihood_power"].iloc[0])
@@ -402,17 +413,19 @@ class KnownParameters:
                 "Nothing was held out (split=1), so that nothing checks these intervals."
             )
         if self.checked:
-            missed = int(are_contradicted(self.rows).sum())
+            contradicted = int(are_contradicted(self.rows).sum())
             sentence = (
                 f"Forecasts from these posteriors hold {self.rows['held'].mean():.0%} of the"
                 f" held-out parts ({INTERVAL_LEVEL:.0%} would be right)"
             )
+            # Posteriors that are right are contradicted with the probability UNLIKELY each, which
+            # is a binomial number of pairs: its mean and two standard deviations are no surprise.
             allowed = UNLIKELY * pairs + 2.0 * math.sqrt(UNLIKELY * (1.0 - UNLIKELY) * pairs)
-            if missed > allowed:
+            if contradicted > allowed:
                 sentence += (
-                    f"; of {missed} of {pairs} pairs less than chance allows (held_chance below"
-                    f" {UNLIKELY:g} in fits.parquet): doubt the intervals, the model or its noise"
-                    " is not theirs"
+                    f"; of {contradicted} of {pairs} pairs less than chance allows (held_chance"
+                    f" below {UNLIKELY:g} in fits.parquet): doubt the intervals, the model or its"
+                    " noise is not theirs"
                 )
             sentences.append(f"{sentence}.")
         return sentences
@@ -424,24 +437,24 @@ class KnownParameters:
         doubtful = list(self.rows["pair_id"][~self.reliable])
         if doubtful:
             named = ", ".join(map(str, doubtful[:3])) + (" ..." if len(doubtful) > 3 else "")
-            why = f"samples of these posteriors do not settle (pareto_k above {MAX_PARETO_K}"
+            reason = f"samples of these posteriors do not settle (pareto_k above {MAX_PARETO_K}"
             if "r_hat" in self.rows:
-                why = (
+                reason = (
                     f"chains differ or leave out a part (r_hat above {MIXED} or divergences above"
                     f" {DIVERGENT}"
                 )
-            such = "too narrow"
+            consequence = "too narrow"
             if "expected_coverage" in self.rows:
-                such = "the network's alone"
+                consequence = "the network's alone"
             sentences.append(
                 f"Do not rely on the intervals of {len(doubtful)} of {pairs} pairs ({named}):"
-                f" {why} in fits.parquet), and such intervals are {such}."
+                f" {reason} in fits.parquet), and such intervals are {consequence}."
             )
         if "expected_coverage" in self.rows:
-            held = float(self.rows["expected_coverage"].median())
-            if abs(held - INTERVAL_LEVEL) > OFF:
+            coverage = float(self.rows["expected_coverage"].median())
+            if abs(coverage - INTERVAL_LEVEL) > OFF:
                 sentences.append(
-                    f"Intervals of the network alone hold {held:.0%} of simulated drivers'"
+                    f"Intervals of the network alone hold {coverage:.0%} of simulated drivers'"
                     f" parameters instead of {INTERVAL_LEVEL:.0%} (expected_coverage in"
                     " fits.parquet): it has learned too little."
                 )
@@ -592,14 +605,14 @@ class Sites(ResultTable):
                 columns[f"{metric}_{method}"] = f"{metric}/{method}"
         for baseline in BASELINES:
             columns[f"over_{baseline}"] = f"improvement/{evaluation.judge}/{baseline}"
-        found: dict[str, float] = {}
+        metrics: dict[str, float] = {}
         table = evaluation.tables["sites"]
         for _, row in table[table["driver_type"] == ALL_SITES].iterrows():
-            site = re.sub(r"[^\w.\- ]", "_", str(row["site"]))
-            part = "" if row["scope"] == "test" else "full_trajectory/"
+            site = re.sub(r"[^\w.\- ]", "_", str(row["site"]))  # as MLflow takes names
+            scope = "" if row["scope"] == "test" else "full_trajectory/"
             for column in row.index.intersection(list(columns)):
-                found[f"{part}site/{site}/{columns[column]}"] = float(row[column])
-        return found
+                metrics[f"{scope}site/{site}/{columns[column]}"] = float(row[column])
+        return metrics
 
     def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[Table]:
         for scope, rows in evaluation.tables["sites"].groupby("scope", sort=False):
@@ -612,20 +625,26 @@ def _sites_printed(rows: pd.DataFrame, scope: str, judge: MetricInfo) -> Table:
     table.add_column("site")
     table.add_column("drivers", justify="right")
     measured = set(rows.dropna(axis=1, how="all"))
-    methods = [one for one in METHODS if f"{judge.name}_{one}" in measured and one != "shrunk"]
-    for method in methods:
-        table.add_column(short_label(method), justify="right")
-    baselines = [one for one in BASELINES if f"over_{one}" in measured]
-    for baseline in baselines:
-        table.add_column(f"over {short_label(baseline)}", justify="right")
+    error_columns = []
+    for method in METHODS:
+        column = f"{judge.name}_{method}"
+        if column in measured and method != "shrunk":
+            table.add_column(short_label(method), justify="right")
+            error_columns.append(column)
+    improvement_columns = []
+    for baseline in BASELINES:
+        column = f"over_{baseline}"
+        if column in measured:
+            table.add_column(f"over {short_label(baseline)}", justify="right")
+            improvement_columns.append(column)
     for _, row in rows.iterrows():
         name = escape(str(row["site"]))
         if row["driver_type"] != ALL_SITES:
             name = f"  {escape(str(row['driver_type']))}"
-        cells = [f"{row[f'{judge.name}_{method}']:.3f}" for method in methods]
-        for baseline in baselines:
-            value, low, high = (row[f"over_{baseline}{end}"] for end in ("", "_low", "_high"))
-            cell = f"{100 * value:+.1f}"
+        cells = [f"{row[column]:.3f}" for column in error_columns]
+        for column in improvement_columns:
+            cell = f"{100 * row[column]:+.1f}"
+            low, high = row[f"{column}_low"], row[f"{column}_high"]
             if math.isfinite(low):
                 cell += f"\n{100 * low:+.1f} to {100 * high:+.1f}"
             cells.append(cell)
@@ -648,7 +667,7 @@ class SiteStyles(ResultTable):
         Column("score_high", "1", "its upper end"),
         Column("score_q25", "1", "lower quartile of the scores"),
         Column("score_q75", "1", "upper quartile of the scores"),
-        *(Column(one.name, one.unit, "median of an indicator") for one in INDICATORS),
+        *_indicator_columns("median of an indicator"),
     )
 
     def rows(self, evaluation: Evaluation) -> Iterable[pd.DataFrame | None]:
@@ -670,8 +689,8 @@ class StyleDistances(ResultTable):
         Column("p_value", "1", "of a permutation of drivers, corrected for all comparisons"),
         Column("most", "", "the indicator that differs most", "text"),
         *(
-            Column(f"distance_{one.name}", "1", "of a normalised indicator times its weight")
-            for one in INDICATORS
+            Column(f"distance_{name}", "1", "of a normalised indicator times its weight")
+            for name in INDICATOR_NAMES
         ),
     )
 
@@ -728,7 +747,7 @@ class Past(ResultTable):
 
     def metrics(self, evaluation: Evaluation) -> Mapping[str, float]:
         table = evaluation.tables["past"]
-        found = {
+        metrics = {
             "past/share": float(table["share"].mean()),
             "past/rmse_speed/alone": float(table["rmse_speed_alone"].mean()),
             "past/ratio/alone": _ratio(table["past_rmse_speed_alone"], table),
@@ -737,11 +756,11 @@ class Past(ResultTable):
             bound = table[f"bound_{method}"].dropna()
             if len(bound):
                 below = table.loc[bound.index, f"rmse_speed_{method}"] <= bound
-                found[f"past/bound/{method}"] = float(bound.mean())
-                found[f"past/coverage/{method}"] = float(below.mean())
+                metrics[f"past/bound/{method}"] = float(bound.mean())
+                metrics[f"past/coverage/{method}"] = float(below.mean())
         if "unlike" in table and table["unlike"].notna().any():
-            found["past/unlike"] = float((table["unlike"].dropna() > _UNLIKE).mean())
-        return found
+            metrics["past/unlike"] = float((table["unlike"].dropna() > _UNLIKE).mean())
+        return metrics
 
     def console(self, evaluation: Evaluation, metrics: Mapping[str, float]) -> Iterable[str]:
         """Returns how the two drove together, what error to expect, and a warning."""

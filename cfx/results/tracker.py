@@ -149,16 +149,15 @@ def tracked(config: JobConfig, folder: Path) -> Iterator[Tracker]:
 
 def tracking_of_run(text: str) -> Tracking:
     """Returns the first installed tracking whose ids of runs look like this; else MLflow."""
-    installed = {name: tracking_named(name) for name in registry.names("tracker")}
-    for tracking in installed.values():
+    for tracking in map(tracking_named, registry.names("tracker")):
         if tracking.is_run_id(text):
             return tracking
-    return installed[MLFLOW]
+    return tracking_named(MLFLOW)
 
 
 def is_run_id(text: str) -> bool:
     """Says whether this could be the id of a run of an installed tracking."""
-    return any(tracking_named(name).is_run_id(text) for name in registry.names("tracker"))
+    return tracking_of_run(text).is_run_id(text)
 
 
 def folder_of(folder_or_run: str | Path, uri: str | None = None) -> Path:

@@ -44,9 +44,9 @@ is usual, since they accelerate slowly; with twice the acceleration T has to be 
 _CRUISE_MPS = (8.0, 17.0)  # of streets with lights
 _SETTLE_S = 20.0  # behind the first vehicle, before the recording begins
 _APPROACH_S = (5.0, 10.0)  # from the beginning to the first vehicle's braking
-_BRAKING_MPS2, _ACCELERATION_MPS2 = (1.2, 2.2), (1.3, 2.0)
+_BRAKING_MPS2, _ACCELERATION_MPS2 = (1.2, 2.2), (1.3, 2.0)  # of the first vehicle
 _RED_S = (10.0, 20.0)  # for which the first vehicle stands
-_JERK_MPS3 = 1.5
+_JERK_MPS3 = 1.5  # how fast its acceleration grows as it leaves
 
 
 def queue_pairs(count: int, dt: float, frames: int, seed: int) -> PairSet:

@@ -22,9 +22,11 @@ class CiteCommand(Command):
         from cfx.app.nodes import shipped
 
         entry = yaml.safe_load(shipped("CITATION.cff").read_text(encoding="utf-8"))
-        names = [f"{{{author['name']}}}" for author in entry["authors"]]
-        more = {"version": entry["version"], "note": f"{entry['license']} licence"}
-        print(_item("software", "cfx", entry["title"], names, more))
+        groups = []  # the authors of the software are groups, which have no family names
+        for author in entry["authors"]:
+            groups.append(_in_braces(author["name"]))
+        edition = {"version": entry["version"], "note": f"{entry['license']} licence"}
+        print(_item("software", "cfx", entry["title"], groups, edition))
         for article in entry["references"]:  # the method that cfx began from
             authors = article["authors"]
             names = []
@@ -36,7 +38,14 @@ class CiteCommand(Command):
 
 
 def _item(kind: str, key: str, title: str, authors: list[str], more: dict[str, Any]) -> str:
-    """Returns an entry of a bibliography."""
-    fields = {"title": f"{{{title}}}", "author": " and ".join(authors), **more}
-    lines = [f"  {name} = {{{value}}}," for name, value in fields.items()]
-    return "\n".join([f"@{kind}{{{key},", *lines, "}"])
+    """Returns an entry of a bibliography in BibTeX; `more` holds its further fields."""
+    fields = {"title": _in_braces(title), "author": " and ".join(authors), **more}
+    lines = [f"@{kind}{{{key},"]
+    for name, value in fields.items():
+        lines.append(f"  {name} = {_in_braces(str(value))},")
+    return "\n".join([*lines, "}"])
+
+
+def _in_braces(text: str) -> str:
+    """Returns a text that BibTeX leaves as it is: no other capitals, no part taken as a surname."""
+    return "{" + text + "}"

@@ -163,7 +163,7 @@ def _describe(options: argparse.Namespace) -> None:
     settings = settings or {}
     if pairs is not None:
         pairs = with_names(pairs, settings.get("site"), settings.get("vehicle"))
-    if pairs is None or len({pair.site for pair in pairs}) < 2:
+    if pairs is None or len(set(pairs.sites)) < 2:
         if compares:
             raise ConfigError(
                 "cfx data describe: --style and --figure compare sites, and there is one alone;"

@@ -29,19 +29,19 @@ class PluginsCommand(Command):
     summary = "installed components; show prints one (check and new: cfx-contracts)"
 
     def parser(self) -> argparse.ArgumentParser:
-        made = argparse.ArgumentParser(
+        parser = argparse.ArgumentParser(
             "cfx plugins",
             description="Shows the installed components, without importing any. cfx plugins check"
             " tries them and cfx plugins new writes a package of your own (cfx-contracts).",
         )
-        actions = made.add_subparsers(dest="action")
+        actions = parser.add_subparsers(dest="action")
         show = actions.add_parser("show", help="a component's parameters, settings and reference")
         add_kind(show)
         complete_with(
             show.add_argument("name", help="one component"),
             lambda options: registry.names(options.kind),
         )
-        return made
+        return parser
 
     def run(self, options: argparse.Namespace) -> int:
         if options.action == "show":
@@ -57,16 +57,16 @@ def overview() -> None:
     states = set()
     for kind in registry.every_kind():
         for entry in registry.entries(kind):
-            now = _state(entry)
-            states.add(now)
-            rows.add_row(kind, entry.name, entry.distribution, entry.version, entry.location, now)
+            state = _state(entry)
+            states.add(state)
+            rows.add_row(kind, entry.name, entry.distribution, entry.version, entry.location, state)
     print_table(rows)
     if states & {"broken", "shadowed"}:
         print("cfx plugins check says what is wrong, and what to do.")
 
 
 def _state(entry: registry.Entry) -> str:
-    """Returns what is known of a component without importing it."""
+    """Returns a component's state, as far as it is known without importing the component."""
     if registry.rivals(entry):
         return "shadowed"
     if registry.other_api(entry):
@@ -121,17 +121,23 @@ def _use(entry: registry.Entry, cls: Any) -> str:
     if entry.kind == "command":
         return f"Run it with cfx {name}; cfx {name} --help says what it takes."
     if entry.kind == "table":
-        who = "Every job" if entry.distribution == OWN else f"A job with tables=[own,{name}]"
-        return f"{who} writes {name}{cls.suffix} where it has rows of it."
+        return f"{_jobs_with('tables', entry)} writes {name}{cls.suffix} where it has rows of it."
     if entry.kind == "figure":
-        who = "Every job" if entry.distribution == OWN else f"A job with figures=[own,{name}]"
-        return f"{who} draws it where it has what it shows: figures/{name}.png."
+        jobs = _jobs_with("figures", entry)
+        return f"{jobs} draws it where it has what it shows: figures/{name}.png."
     if entry.kind == "metric":
-        who = "Every job" if entry.distribution == OWN else f"A job with metrics=[own,{name}]"
-        return f"{who} measures it; with {kind.call(name)} no others but those that a job needs."
+        jobs = _jobs_with("metrics", entry)
+        return f"{jobs} measures it; with {kind.call(name)} no others but those that a job needs."
     if entry.kind == "input":
         return f"Choose it with policy.inputs=[situation,{name}], beside the usual ones."
     return f"Choose it with {kind.call(name)}."
+
+
+def _jobs_with(setting: str, entry: registry.Entry) -> str:
+    """Returns which jobs have a table, figure or metric: cfx's own need not be named."""
+    if entry.distribution == OWN:
+        return "Every job"
+    return f"A job with {setting}=[own,{entry.name}]"
 
 
 def _metric(cls: Any) -> Table:
@@ -207,8 +213,9 @@ def _values(field: FieldInfo) -> str:
     """Returns the type and the bounds that a setting must keep."""
     kind: Any = field.annotation
     parts = [_type(kind)]
-    if type(None) in get_args(kind):
-        parts = [" or ".join(_type(part) for part in get_args(kind))]
+    alternatives = get_args(kind)
+    if type(None) in alternatives:  # a setting that may be null
+        parts = [" or ".join(map(_type, alternatives))]
     for rule in field.metadata:
         for key, sign in {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}.items():
             if hasattr(rule, key):

@@ -18,17 +18,17 @@ class PoliciesCommand(Command):
     summary = "the ready-made policies; the card of one (show)"
 
     def parser(self) -> argparse.ArgumentParser:
-        made = argparse.ArgumentParser(
+        parser = argparse.ArgumentParser(
             "cfx policies",
             description="Lists the ready-made policies that come with cfx.",
             epilog="cfx policies make, of the distribution cfx-report, trains them anew.",
         )
-        actions = made.add_subparsers(dest="action")
+        actions = parser.add_subparsers(dest="action")
         actions.add_parser("list", help="all of them, as without an action")
         show = actions.add_parser("show", help="the card of a policy: what it knows, and how well")
         name = show.add_argument("name", help="such as idm, or cfx://idm")
         complete_with(name, lambda _: ready.names())
-        return made
+        return parser
 
     def run(self, options: argparse.Namespace) -> int:
         if options.action == "show":
@@ -41,8 +41,9 @@ class PoliciesCommand(Command):
         return 0
 
 
-_WORD = re.compile(r"\*\*([a-z ]+)\*\* \|$")
-"""A word at the end of a row of the table of traffic: a value that is not usual."""
+_UNUSUAL = re.compile(r"\*\*([a-z ]+)\*\* \|$")
+"""The verdict at the end of a row of a card's table of traffic, such as `**low** |`, where a value
+lies outside what is usual of people; rows with a usual value end without one."""
 
 
 def _show(text: str) -> None:
@@ -55,11 +56,11 @@ def _show(text: str) -> None:
         return
     console = Console(markup=False, highlight=False, soft_wrap=True)
     for line in text.splitlines():
-        shown = Text(line)
-        match = _WORD.search(line)
-        if match is not None:
-            shown.stylize("bold red", match.start(1), match.end(1))
-        console.print(shown)
+        text_of_line = Text(line)
+        verdict = _UNUSUAL.search(line)
+        if verdict is not None:
+            text_of_line.stylize("bold red", verdict.start(1), verdict.end(1))
+        console.print(text_of_line)
 
 
 def _overview() -> None:

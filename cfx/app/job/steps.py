@@ -88,27 +88,22 @@ def calibration_tables(
         )
     if not calibrated or (elsewhere and settings.posterior == "none"):
         return {}
-    number = {pair.pair_id: index for index, pair in enumerate(context.pairs)}
     ids = evaluation.about["pair_id"].drop_duplicates().astype(str).tolist()
-    chosen = torch.tensor([number[name] for name in ids])
-    batch = context.batch[chosen.to(context.batch.lengths.device)]
-    last = Split.of(context.pairs, context.windows, context.split).frame[chosen]
+    # Where the tested pairs stand among all.
+    numbers = pd.Index(context.pairs.ids).get_indexer(pd.Index(ids))
+    tested = torch.from_numpy(numbers)
+    batch = context.batch[tested.to(context.batch.lengths.device)]
+    last = Split.of(context.pairs, context.windows, context.split).frame[tested]
+    ends_apart = context.calibrator.apart(context.pairs.take(numbers.tolist()), last)
     fits = []
     tables = {}
     for method in evaluation.methods:
         if method in _CONSTANT:
             parameters = _parameters(evaluation, method, ids, batch.leader_length)
-            of_method = evaluation.table[evaluation.table["method"] == method]
-            rows = of_method[["pair_id", "driver"]].reset_index(drop=True).assign(method=method)
             errors = training_errors(context.calibrator, batch, last, parameters)
-            for name, values in errors.items():
-                rows[f"train_{name}"] = values.cpu().numpy()
-                if context.split < 1:  # else nothing was tested
-                    rows[f"test_{name}"] = of_method[name].to_numpy(dtype=np.float64)
-            tested = [context.pairs[index] for index in chosen.tolist()]
-            apart = context.calibrator.apart(tested, last)
-            if method == "driver_specific" and not all(map(math.isnan, apart)):
-                rows["ends_apart"] = apart
+            rows = _errors_of_method(evaluation, method, errors, is_tested=context.split < 1)
+            if method == "driver_specific" and not all(map(math.isnan, ends_apart)):
+                rows["ends_apart"] = ends_apart
             if method == "driver_specific" and settings.posterior != "none":
                 solver = context.calibrator.solver
                 method_of = posterior_method(settings.posterior)
@@ -124,12 +119,30 @@ def calibration_tables(
     return {**tables, "fits": pd.concat(fits, ignore_index=True)}
 
 
-def _parameters(evaluation: Evaluation, method: str, ids: list[str], like: Tensor) -> Tensor:
-    """Returns a method's constant parameters `(P, n)`, SI units."""
+def _errors_of_method(
+    evaluation: Evaluation, method: str, training: Mapping[str, Tensor], *, is_tested: bool
+) -> pd.DataFrame:
+    """Returns a row per pair: a method's errors where it was calibrated, and on the test part.
+
+    Args:
+        training: by metric `(P,)`, on the part that was calibrated on.
+        is_tested: there is a test part; else all of the pair was calibrated on.
+    """
+    of_method = evaluation.table[evaluation.table["method"] == method]
+    rows = of_method[["pair_id", "driver"]].reset_index(drop=True).assign(method=method)
+    for name, values in training.items():
+        rows[f"train_{name}"] = values.cpu().numpy()
+        if is_tested:
+            rows[f"test_{name}"] = of_method[name].to_numpy(dtype=np.float64)
+    return rows
+
+
+def _parameters(evaluation: Evaluation, method: str, ids: list[str], reference: Tensor) -> Tensor:
+    """Returns a method's constant parameters `(P, n)`, SI units, of `reference`'s dtype."""
     rows = evaluation.about[evaluation.about["method"] == method].set_index("pair_id")
     columns = [f"parameter_{name}" for name in evaluation.names]
     values = np.array(rows.loc[ids, columns], dtype=np.float64)
-    return torch.as_tensor(values, dtype=like.dtype, device=like.device)
+    return torch.as_tensor(values, dtype=reference.dtype, device=reference.device)
 
 
 @dataclass(frozen=True)

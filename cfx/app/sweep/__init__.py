@@ -125,7 +125,7 @@ class Sweep:
         for sentence in summary.sentences():
             print(sentence)
         code = self._count(statuses, code)
-        if any(status.code == 0 for status in statuses.values()):
+        if _well_ended(statuses):
             for line in lines:
                 print(line)
             folder = shlex.quote(str(self.folder))
@@ -138,19 +138,20 @@ class Sweep:
 
     def _count(self, statuses: Mapping[Path, JobStatus], code: int) -> int:
         """Prints how many jobs are done, and which failed and why; returns the worst exit code."""
-        failed = {path: status for path, status in statuses.items() if status.code}
+        done = _well_ended(statuses)
         total = max(self.record.jobs or 0, len(statuses))
+        print(f"{done} of {total} jobs done; their folders: {self.folder}")
+        codes = {code}
+        for path, status in statuses.items():
+            codes.add(status.code)
+            if status.code:
+                overrides = " ".join(status.overrides)
+                print(f"failed: {overrides}: {status.message} ({path})", file=sys.stderr)
         missing = total - len(statuses)
-        print(f"{len(statuses) - len(failed)} of {total} jobs done; their folders: {self.folder}")
-        for path, status in failed.items():
-            overrides = " ".join(status.overrides)
-            print(f"failed: {overrides}: {status.message} ({path})", file=sys.stderr)
         if missing and code == 0:
             print(f"{missing} jobs left no outcome; see the launcher's own logs", file=sys.stderr)
-            code = 1
-        weights = {0: 0, 2: 1, 1: 2}  # a signal weighs most, then a bug, then a user's mistake
-        codes = (code, *(status.code for status in failed.values()))
-        return max(codes, key=lambda one: weights.get(one, 3))
+            codes.add(1)
+        return max(codes, key=_severity)
 
     def _finish_without_jobs(self, code: int, *, interrupted: bool) -> int:
         """Says that no job ended, or removes a wrong command's folder; returns the exit code."""
@@ -186,14 +187,24 @@ class Sweep:
             return ()
 
 
+def _severity(code: int) -> int:
+    """Returns how bad an exit code is: a signal is worst, then a bug, then a user's mistake."""
+    return {0: 0, 2: 1, 1: 2}.get(code, 3)
+
+
+def _well_ended(statuses: Mapping[Path, JobStatus]) -> int:
+    """Returns how many jobs ended without an error."""
+    return sum(status.code == 0 for status in statuses.values())
+
+
 def _continuing(folder: Path, record: Record, earlier: Record) -> str:
+    """Returns what is printed of a sweep in whose folder another one, or an earlier start, was."""
     if earlier.command_hash != record.command_hash:
         return (
             f"continuing in {folder}, which holds another command's sweep:"
             " jobs that both have in common are not run again"
         )
-    statuses = record.statuses(folder, "").values()
-    done = sum(status.code == 0 for status in statuses)
+    done = _well_ended(record.statuses(folder, ""))
     total = f" of {record.jobs}" if record.jobs else ""
     return f"continuing sweep {folder}: {done}{total} jobs are done"
 

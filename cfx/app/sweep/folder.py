@@ -343,8 +343,10 @@ def command_of(config: DictConfig) -> tuple[tuple[str, ...], str, int | None]:
     """
     typed: Any = OmegaConf.to_container(config.hydra.overrides, resolve=False)
     sweeper: Any = OmegaConf.to_container(config.hydra.sweeper, resolve=False)
-    params = (sweeper.pop("params", None) or {}).items()
-    overrides = [*(f"{key}={value}" for key, value in params), *typed["task"]]
+    overrides = []  # those that the sweeper's own configuration adds come first
+    for key, value in (sweeper.pop("params", None) or {}).items():
+        overrides.append(f"{key}={value}")
+    overrides += typed["task"]
     values: dict[str, list[str]] = {}
     parser = OverridesParser.create(config_loader=GlobalHydra.instance().config_loader())
     for override in parser.parse_overrides(overrides):
@@ -393,7 +395,10 @@ def _state_of_data(node: Any) -> list[list[Any]] | None:
 def _sources(config: Any) -> tuple[Any, ...]:
     """Returns what else decides what the overrides mean: --config-name and --config-dir."""
     sources = config.hydra.runtime.config_sources
-    folders = [str(source.path) for source in sources if source.provider == "command-line"]
+    folders = []
+    for source in sources:
+        if source.provider == "command-line":  # so Hydra calls --config-dir
+            folders.append(str(source.path))
     return str(config.hydra.job.config_name), folders
 
 

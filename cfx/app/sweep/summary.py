@@ -18,7 +18,7 @@ from cfx.evaluation.headline import doubts, judged_method, main_comparison
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.statistics import Ranking, ranking_of
 from cfx.figures.wording import short_label
-from cfx.results.comparison import Comparison, common_judge, objective_of
+from cfx.results.comparison import Comparison, common_judge, minimised_the_same, objective_of
 from cfx.results.result import judge_of, known_metrics
 
 if TYPE_CHECKING:
@@ -145,7 +145,7 @@ class SweepSummary:
 
     @cached_property
     def metrics(self) -> list[MetricInfo]:
-        """What else than the error `judge` any of the jobs has measured."""
+        """What any of the jobs has measured besides the error by which they are compared."""
         infos: dict[str, MetricInfo] = {}
         for job in self.jobs:
             for metric in known_metrics(job.data, job.metrics):
@@ -162,14 +162,16 @@ class SweepSummary:
             `METRIC_METHOD`; other metrics of that method; the improvement over the baseline that
             counts; seconds, state and message.
         """
-        places = {name: place for place, name in enumerate(self.ranking.jobs, start=1)}
+        ranks = {name: rank for rank, name in enumerate(self.ranking.jobs, start=1)}
         rows = []
         for job in self.jobs:
-            rows.append(self._row(job, places.get(self._name(job)) if job.metrics else None))
+            rank = ranks.get(self._name(job)) if job.metrics else None
+            rows.append(self._row(job, rank))
         for name in ("over", *_STATISTICS):
-            if not any(row[f"improvement_{name}"] for row in rows):  # they are calibrations
+            column = f"improvement_{name}"
+            if not any(row[column] for row in rows):  # calibrations have no improvement
                 for row in rows:
-                    del row[f"improvement_{name}"]
+                    del row[column]
         return sorted(rows, key=lambda row: row["rank"] or math.inf)
 
     def _row(self, job: SweptJob, rank: int | None) -> dict[str, Any]:
@@ -208,35 +210,37 @@ class SweepSummary:
 
     def table(self) -> Table:
         """Returns `rows` as a rich table, without columns that say the same of all jobs."""
+        import pandas as pd
+
+        rows = pd.DataFrame(self.rows, dtype=object)
         columns: dict[str, list[str]] = {}
         for key in self.differing:
-            columns[key] = [str(row[key]) for row in self.rows]
+            columns[key] = rows[key].map(str).tolist()
         if not self.differing:
-            columns["job"] = [row["folder"] for row in self.rows]
-        shown: dict[str, list[str]] = {"judged by": [], self.judge.title: []}
-        for row in self.rows:
-            shown["judged by"].append(short_label(row["method"]))
-            shown[self.judge.title].append(_number(row[f"error_{self.judge.name}"]))
+            columns["job"] = rows["folder"].tolist()
+        candidates = {
+            "judged by": rows["method"].map(short_label),
+            self.judge.title: rows[f"error_{self.judge.name}"].map(_number),
+        }
         for constant in _CONSTANT:
-            column = f"{self.judge.name}_{constant}"
             title = f"{self.judge.heading},\n{short_label(constant)}"
-            shown[title] = [_number(row[column]) for row in self.rows]
+            candidates[title] = rows[f"{self.judge.name}_{constant}"].map(_number)
         for metric in self.metrics:
             if metric.headline:
-                shown[metric.title] = [_number(row[metric.name]) for row in self.rows]
-        shown["improvement\n(95 % interval)"] = [self._improvement(row) for row in self.rows]
-        shown["state"] = [row["state"] for row in self.rows]
-        for title, values in shown.items():
-            says_something = len(set(values)) > 1 or len(values) == 1
-            if any(values) and (says_something or title == self.judge.title):
-                columns[title] = values
-        columns["time [s]"] = [f"{row['seconds']:.1f}" for row in self.rows]
+                candidates[metric.title] = rows[metric.name].map(_number)
+        candidates["improvement\n(95 % interval)"] = pd.Series(map(self._improvement, self.rows))
+        candidates["state"] = rows["state"]
+        for title, cells in candidates.items():
+            differs = len(set(cells)) > 1 or len(cells) == 1
+            if cells.any() and (differs or title == self.judge.title):
+                columns[title] = cells.tolist()
+        columns["time [s]"] = rows["seconds"].map("{:.1f}".format).tolist()
         table = blank_table(title="The sweep, the smallest error on the same pairs first")
         for title in columns:
             is_text = title in {*self.differing, "job", "judged by", "state"}
             table.add_column(title, justify="left" if is_text else "right", overflow="fold")
-        for cells in zip(*columns.values(), strict=True):
-            table.add_row(*cells)
+        for row in zip(*columns.values(), strict=True):
+            table.add_row(*row)
         return table
 
     def _improvement(self, row: Mapping[str, Any]) -> str:
@@ -258,8 +262,8 @@ class SweepSummary:
 
     def sentences(self) -> list[str]:
         """Returns how the jobs were compared, and which is closest to the drivers."""
-        same = len({objective for _, objective in self._objectives}) <= 1
-        return Comparison(self.judge, self.ranking, same).sentences()
+        is_same = minimised_the_same(self._objectives)
+        return Comparison(self.judge, self.ranking, is_same).sentences()
 
 
 def _number(value: float | None) -> str:

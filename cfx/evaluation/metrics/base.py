@@ -134,8 +134,7 @@ class Metric(Component):
         for name, choices in allowed:
             if getattr(cls, name) not in choices:
                 return f" says {name}={getattr(cls, name)!r}; choose one of {', '.join(choices)}"
-        unknown = [scope for scope in cls.scopes if scope not in SCOPES]
-        if unknown or not cls.scopes:
+        if not cls.scopes or set(cls.scopes) - set(SCOPES):
             return f" says scopes={cls.scopes!r}; choose some of {', '.join(SCOPES)}"
         if cls.schema.model_fields:
             return " must have no settings, so that its name means the same number in every job"
@@ -234,7 +233,10 @@ def info_of(
         judges: the job is judged by it: it is shown everywhere, of each scope.
     """
     metric = installed.component
-    scopes = SCOPES if judges else metric.scopes
+    scopes = []
+    for scope in SCOPES if judges else metric.scopes:
+        if scope in measured:
+            scopes.append(scope)
     return MetricInfo(
         name=installed.name,
         unit=metric.unit,
@@ -242,7 +244,7 @@ def info_of(
         summary=metric.summary,
         heading=metric.heading,
         meaning=metric.meaning,
-        scopes=tuple(scope for scope in scopes if scope in measured),
+        scopes=tuple(scopes),
         headline=metric.headline or judges,
         distribution=installed.distribution,
     )
@@ -294,8 +296,11 @@ class MetricSet:
     @classmethod
     def own(cls) -> MetricSet:
         """Makes cfx's own metrics."""
-        entries = registry.entries("metric")
-        return cls(in_order([made(entry) for entry in entries if entry.distribution == OWN]))
+        metrics = []
+        for entry in registry.entries("metric"):
+            if entry.distribution == OWN:
+                metrics.append(made(entry))
+        return cls(in_order(metrics))
 
 
 def entries_of(chosen: str | Sequence[str] = ALL_OWN) -> tuple[registry.Entry, ...]:
@@ -307,13 +312,18 @@ def entries_of(chosen: str | Sequence[str] = ALL_OWN) -> tuple[registry.Entry, .
     Raises:
         PluginError: there is no metric of a name.
     """
-    usable = [entry for entry in registry.entries("metric") if not registry.rivals(entry)]
+    usable, own_names = [], set()
+    for entry in registry.entries("metric"):
+        if not registry.rivals(entry):
+            usable.append(entry)
+            if entry.distribution == OWN:
+                own_names.add(entry.name)
     if chosen == "all":
         return tuple(usable)
     names = {*ALWAYS, *([chosen] if isinstance(chosen, str) else chosen)}
     if ALL_OWN in names:
         names.remove(ALL_OWN)
-        names.update(entry.name for entry in usable if entry.distribution == OWN)
+        names |= own_names
     return tuple(registry.entry("metric", name) for name in sorted(names))
 
 

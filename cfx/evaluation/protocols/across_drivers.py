@@ -232,7 +232,7 @@ class AcrossDrivers(Protocol):
         pooled: Tensor,
         labels: WindowLabels | None,
     ) -> _Calibrated:
-        """Returns what was calibrated, with what policies start from."""
+        """Returns the calibrated parameters, and those from which the policies' answers start."""
         s = self.settings
         start = pooled
         if s.base == "default":
@@ -324,6 +324,10 @@ def _training_data(
     start = calibrated.start[network]
     # Also where both bases are the same: for unseen drivers nothing of their history is observed.
     base = start if calibrated.base is None else calibrated.base[rows]
+    drivers, sites = [], []
+    for number in index.tolist():
+        drivers.append(context.pairs[number].driver)
+        sites.append(context.pairs[number].site)
     pairs = TrainingPairs(
         index=rows,
         split=full[index],
@@ -331,7 +335,7 @@ def _training_data(
         start=start,
         base=base,
         labels=None if calibrated.labels is None else calibrated.labels.select(index),
-        drivers=tuple(context.pairs[number].driver for number in index.tolist()),
-        sites=tuple(context.pairs[number].site for number in index.tolist()),
+        drivers=tuple(drivers),
+        sites=tuple(sites),
     )
     return context.training_data(pairs, names)

@@ -131,7 +131,10 @@ class FinishedPolicy:
                 f" {pairs.dt:g} s; set data.time_step={policy.dt:g}"
             )
         learned_from = LearnedFrom(policy.trained_on.pairs)
-        learned_pairs = [pair.pair_id for pair in pairs if pair in learned_from]
+        learned_pairs = []
+        for pair in pairs:
+            if pair in learned_from:
+                learned_pairs.append(pair.pair_id)
         if learned_pairs:
             raise DataError(
                 f"{where}: this policy has learned from {len(learned_pairs)} of the {len(pairs)}"
@@ -155,8 +158,8 @@ class FinishedPolicy:
             )
 
     def _named_alike(self, pairs: PairSet) -> int:
-        """Counts drivers here who have the name of one that the policy learned from."""
-        return len({pair.driver for pair in pairs} & set(self.agent.trained_on.pairs.values()))
+        """Counts the drivers that have the same name as one that the policy learned from."""
+        return len(set(pairs.drivers) & set(self.agent.trained_on.pairs.values()))
 
 
 class FoldsOrFinishedSettings(AcrossDriversSettings):
@@ -204,14 +207,17 @@ class FoldsOrFinished(AcrossDrivers):
         Raises:
             DataError: none is.
         """
-        least = self.settings.min_test_duration
-        if least is None:
+        min_duration = self.settings.min_test_duration
+        if min_duration is None:
             return context
-        long = [number for number, pair in enumerate(context.pairs) if pair.lasts(least)]
+        long = []
+        for number, pair in enumerate(context.pairs):
+            if pair.lasts(min_duration):
+                long.append(number)
         if not long:
             raise DataError(
-                f"no pair in {context.pairs.source} lasts protocol.min_test_duration={least:g} s;"
-                " lower it"
+                f"no pair in {context.pairs.source} lasts"
+                f" protocol.min_test_duration={min_duration:g} s; lower it"
             )
         if len(long) == len(context.pairs):
             return context

@@ -20,7 +20,7 @@ from scipy.sparse.csgraph import connected_components
 from sklearn.model_selection import GroupKFold
 from torch import Tensor
 
-from cfx.data.pairs import Pair, PairSet
+from cfx.data.pairs import Pair, PairSet, of_each
 from cfx.errors import DataError, listed
 
 log = logging.getLogger(__name__)
@@ -124,26 +124,25 @@ def _too_few(
 
 
 def _groups(pairs: PairSet, together: Together) -> Sequence[Any]:
-    """Returns what each pair's fold is chosen for."""
+    """Returns the group of each pair (its driver, platoon, ...); a fold has whole groups."""
     if together == "platoon":
         return _platoons(pairs)
     if together == "vehicle":
         return [pair.vehicle or pair.driver for pair in pairs]
-    return [getattr(pair, together) for pair in pairs]
+    return of_each(pairs, together)
 
 
 def _platoons(pairs: PairSet) -> list[int]:
     """Numbers the platoon of each pair: vehicles that follow one another, also through others."""
-    leaders = [_leader(pair) for pair in pairs]
-    followers = [_follower(pair) for pair in pairs]
-    vehicles = sorted({*leaders, *followers})
-    number = {vehicle: index for index, vehicle in enumerate(vehicles)}
-    rows = [number[leader] for leader in leaders]
-    columns = [number[follower] for follower in followers]
-    edges = (np.ones(len(rows)), (np.array(rows), np.array(columns)))
-    graph = coo_array(edges, shape=(len(vehicles), len(vehicles)))
-    _, platoon = connected_components(graph, directed=False)
-    return [int(platoon[index]) for index in columns]
+    leaders = list(map(_leader, pairs))
+    followers = list(map(_follower, pairs))
+    vehicles, numbers = np.unique([leaders, followers], return_inverse=True)
+    leader, follower = numbers.reshape(2, len(pairs))
+    # Vehicles are nodes, pairs are edges; a platoon is what hangs together.
+    graph = coo_array((np.ones(len(pairs)), (leader, follower)), shape=(len(vehicles),) * 2)
+    _, platoon_of_vehicle = connected_components(graph, directed=False)
+    platoons: list[int] = platoon_of_vehicle[follower].tolist()
+    return platoons
 
 
 def _leader(pair: Pair) -> str:
@@ -165,22 +164,20 @@ def describe_folds(pairs: PairSet, fold: Tensor, together: Together) -> dict[str
     Returns:
         What `data.json` says of the folds.
     """
-    places = fold.tolist()
+    fold_of_pair = fold.tolist()
+    folds = max(fold_of_pair) + 1
     fold_of_driver: dict[str, int] = {}
-    for pair, place in zip(pairs, places, strict=True):
-        if place >= 0:
-            fold_of_driver[pair.driver] = place
-    behind_trained, leaders = _on_both_sides(pairs, places)
-    folds = max(places) + 1
-    tested = sum(place >= 0 for place in places)
-    recordings = []
-    for number in range(folds):
-        tested_there = zip(pairs, places, strict=True)
-        recordings.append(
-            sorted({pair.recording for pair, place in tested_there if place == number})
-        )
-    with_known_leader = [pair for pair in pairs if pair.leader_id != f"ahead of {pair.follower_id}"]
-    if with_known_leader:
+    recordings_of_fold: list[set[str]] = [set() for _ in range(folds)]
+    tested, is_leader_known = 0, False
+    for pair, number in zip(pairs, fold_of_pair, strict=True):
+        is_leader_known |= pair.leader_id != f"ahead of {pair.follower_id}"
+        if number >= 0:
+            tested += 1
+            fold_of_driver[pair.driver] = number
+            recordings_of_fold[number].add(pair.recording)
+    recordings = list(map(sorted, recordings_of_fold))
+    behind_trained, leaders = _on_both_sides(pairs, fold_of_pair)
+    if is_leader_known:
         log.info(
             "%d folds over %d drivers; test pairs behind a driver of the training part: %d of %d;"
             " tested drivers who lead one there: %d (both share the leader's trajectory alone)",
@@ -200,35 +197,40 @@ def describe_folds(pairs: PairSet, fold: Tensor, together: Together) -> dict[str
         for number, names in enumerate(recordings):
             text = "Fold %d is tested on %s and learns nothing from there"
             log.info(text, number, listed(names, 3))
-    in_folds = list(fold_of_driver.values())
-    others = "sites" if together == "site" else "recordings" if together == "recording" else "folds"
+    drivers_of_fold = np.bincount(list(fold_of_driver.values()), minlength=folds)
+    part = {"site": "site", "recording": "recording"}.get(together, "fold")
     return {
         "folds": folds,
-        "pooled_over": f"{folds - 1} other {others if folds > 2 else others[:-1]}",
+        "pooled_over": f"{folds - 1} other {part}{'s' if folds > 2 else ''}",
         "recordings_per_fold": recordings,
         "drivers": len(fold_of_driver),
-        "drivers_per_fold": [in_folds.count(number) for number in range(folds)],
-        "test_pairs_behind_a_training_driver": behind_trained if with_known_leader else None,
-        "test_drivers_who_lead_a_training_pair": len(leaders) if with_known_leader else None,
+        "drivers_per_fold": drivers_of_fold.tolist(),
+        "test_pairs_behind_a_training_driver": behind_trained if is_leader_known else None,
+        "test_drivers_who_lead_a_training_pair": len(leaders) if is_leader_known else None,
         "pairs_only_learned_from": len(pairs) - tested,
     }
 
 
-def _on_both_sides(pairs: PairSet, places: Sequence[int]) -> tuple[int, set[str]]:
-    """Returns how many test pairs follow a training driver, and the test drivers who lead one."""
+def _on_both_sides(pairs: PairSet, fold_of_pair: Sequence[int]) -> tuple[int, set[str]]:
+    """Returns how many test pairs follow a training driver, and the test drivers who lead one.
+
+    Args:
+        pairs: P pairs.
+        fold_of_pair: P numbers, as the module says: -2 - k is a short pair of fold k.
+    """
     fold_of_follower: dict[str, int] = {}
     not_learned_in: dict[str, int] = {}
-    for pair, place in zip(pairs, places, strict=True):
-        if place >= 0:
-            fold_of_follower[_follower(pair)] = place
-        not_learned_in[_follower(pair)] = place if place >= 0 else -2 - place
+    for pair, number in zip(pairs, fold_of_pair, strict=True):
+        if number >= 0:
+            fold_of_follower[_follower(pair)] = number
+        not_learned_in[_follower(pair)] = number if number >= 0 else -2 - number
     behind_trained = 0
     leaders = set()
-    for pair, place in zip(pairs, places, strict=True):
+    for pair, number in zip(pairs, fold_of_pair, strict=True):
         leader = _leader(pair)
-        if place >= 0 and leader in not_learned_in and not_learned_in[leader] != place:
+        if number >= 0 and leader in not_learned_in and not_learned_in[leader] != number:
             behind_trained += 1
-        leads_in = fold_of_follower.get(leader)
-        if leads_in is not None and place not in {leads_in, -2 - leads_in}:
+        fold_of_leader = fold_of_follower.get(leader)
+        if fold_of_leader is not None and number not in {fold_of_leader, -2 - fold_of_leader}:
             leaders.add(leader)
     return behind_trained, leaders

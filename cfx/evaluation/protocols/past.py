@@ -76,8 +76,8 @@ class PastErrors:
         """RMSE of the weighted mean of the two simulations, `(D,)`, m/s."""
         weight = self.weight
         squares = weight**2 * self.policy + (1.0 - weight) ** 2 * self.own
-        both = squares + 2.0 * weight * (1.0 - weight) * self.product
-        return np.sqrt(np.maximum(both, 0.0))
+        squared_error = squares + 2.0 * weight * (1.0 - weight) * self.product
+        return np.sqrt(np.maximum(squared_error, 0.0))
 
     def together_with(self, values: Tensor) -> OwnParameters:
         """Returns the driver-specific parameters that drive beside the policy.

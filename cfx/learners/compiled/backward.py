@@ -20,7 +20,7 @@ from cfx.learners.rollout.window import GradientPath
 
 
 class BackwardPass:
-    """Goes back through the windows of a forward pass.
+    """Back-propagates through the windows of a forward pass, the last one first.
 
     Gradients by gates and answers take the places of these.
 
@@ -86,7 +86,7 @@ class BackwardPass:
         return calls
 
     def _through_drive(self, calls: Calls) -> None:
-        """Adds what goes back from a window's steps to the motion before it and to answers."""
+        """Adds the gradients of a window's steps by the motion before it and by answers."""
         simulated, window = self.simulated, self.simulated.window
         gradients = list(simulated.columns(self.motion, 1).values())
         gradients += [simulated.frames(self.speed), simulated.frames(self.gap)]
@@ -96,7 +96,7 @@ class BackwardPass:
         calls.product(logits, window.network.w_out.mT, output, accumulates=True)
 
     def _through_features(self, calls: Calls) -> None:
-        """Adds what goes back from the first layer to the motion before a window."""
+        """Adds the gradients of the first layer's inputs by the motion before a window."""
         simulated, first = self.simulated, self.simulated.layers[0]
         read = Operand(torch.empty_like(simulated.read[:, :1]))
         calls.product(rows(first.projected), first.weights.w_input.mT, read)
@@ -110,7 +110,7 @@ class BackwardPass:
             calls.add(before[name], gradient)
 
     def _bound(self, calls: Calls) -> None:
-        """Adds what bounds the gradients that come back into a window: none into the last."""
+        """Adds decay and clipping of gradients between windows; the last window has none."""
         path, last = self.path, self.simulated.windows - 1
         decay = path.decay if path.through_motion else 0.0
         for gradient in self.simulated.columns(self.motion, 1).values():
@@ -119,7 +119,7 @@ class BackwardPass:
             calls.bound(rows(carried, 1), path.decay, path.clip, except_window=last)
 
     def _add_to_weights(self, first: int, last: int, networks: slice) -> None:
-        """Adds what some windows give to the gradients of some networks' weights."""
+        """Adds the contribution of some windows to the gradients by some networks' weights."""
         simulated, network = self.simulated, self.simulated.window.network
         drives = first >= simulated.observed
         for number, layer in enumerate(simulated.layers):
@@ -150,5 +150,5 @@ class BackwardPass:
             self._of(network.b_out, networks).add_(logits.sum(1, keepdim=True))
 
     def _of(self, weight: Tensor, networks: slice) -> Tensor:
-        """Returns the gradient by some networks' weights."""
+        """Returns the part of a gradient that belongs to some networks."""
         return self.by_weight[weight][networks]

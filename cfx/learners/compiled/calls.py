@@ -110,7 +110,7 @@ class Calls:
         self._add(_PRODUCT, operands, inner=inner, outer=outer, accumulates=accumulates)
 
     def bound(self, gradient: Operand, scale: float, largest: float, *, except_window: int) -> None:
-        """Adds what scales a gradient and clips it; NaN and infinity become 0.
+        """Adds a call that scales and clips a gradient; NaN and infinity become 0.
 
         Args:
             gradient: changed in place.
@@ -123,7 +123,7 @@ class Calls:
         self._add(_BOUND, (gradient, limits), outer=outer, except_window=except_window)
 
     def add(self, to: Operand, added: Operand) -> None:
-        """Adds what adds one operand to another."""
+        """Adds a call that adds one operand to another."""
         self._add(_ADD, (to, added), outer=to.first.shape[-1])
 
     def run(self, windows: range, networks: slice) -> None:

@@ -145,7 +145,7 @@ class ForwardPass:
 
     @property
     def outputs(self) -> slice:
-        """Which of the numbers that a layer carries are its output."""
+        """Where a layer's output stands in its state; an LSTM's state holds more."""
         return slice(self.window.network.hidden)
 
     def _surroundings(self) -> dict[str, Operand]:
@@ -201,7 +201,7 @@ class ForwardPass:
         return Operand.over(self.inputs.features.unsqueeze(2))
 
     def gates(self, number: int, *, drives: bool) -> dict[str, Operand]:
-        """Returns all that a layer's cell depends on in a window, as operands `(N, D, h, k)`."""
+        """Returns the inputs of a layer's cell in a window, as operands `(N, D, h, k)`."""
         layer, network = self.layers[number], self.window.network
         weights = layer.weights
         bias, hidden = weights.b_input.detach(), weights.b_hidden.detach()

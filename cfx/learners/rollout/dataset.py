@@ -235,12 +235,12 @@ class RolloutDataset:
         pooled = grid.mean(space.to_unit(start)).float()
         last = training_data.pairs.split.frame.to(device)[pair]
         validation = settings.validation
-        held_out, few = _validation_drivers(
+        held_out, has_few_drivers = _validation_drivers(
             training_data, pair.cpu(), present.cpu(), validation, generator
         )
-        held_out, few = held_out.to(device), few.to(device)[:, None]
-        trains = present & (few | ~held_out)
-        until = torch.where(few, (last * (1.0 - validation)).long(), last)
+        held_out, has_few_drivers = held_out.to(device), has_few_drivers.to(device)[:, None]
+        trains = present & (has_few_drivers | ~held_out)
+        until = torch.where(has_few_drivers, (last * (1.0 - validation)).long(), last)
         bases = start
         if training_data.pairs.base is not None:
             bases = head.completed(training_data.pairs.base)
@@ -267,7 +267,7 @@ class RolloutDataset:
             known_as=known_as,
             in_queue=in_queue,
             trains=trains,
-            validates=present & (few | held_out) & (validation > 0),
+            validates=present & (has_few_drivers | held_out) & (validation > 0),
             until=until,
             last=last,
             base=placed,
@@ -549,22 +549,22 @@ def _validation_drivers(
         keep any, bool `(N,)`.
     """
     drivers = training_data.pairs.known_drivers
-    held_out, few = torch.zeros_like(present), torch.zeros(len(pair), dtype=torch.bool)
+    held_out, has_few_drivers = torch.zeros_like(present), torch.zeros(len(pair), dtype=torch.bool)
     for network in range(len(pair)):
         places = present[network].nonzero()[:, 0].tolist()
         driver_at = {}
         for place in places:
             driver_at[place] = drivers[int(pair[network, place])]
         names = sorted(set(driver_at.values()))
-        few[network] = len(names) < _FEW_DRIVERS
-        if few[network] or validation == 0:
+        has_few_drivers[network] = len(names) < _FEW_DRIVERS
+        if has_few_drivers[network] or validation == 0:
             continue
         count = max(1, round(validation * len(names)))
         order = torch.randperm(len(names), generator=generator)[:count]
         chosen = {names[index] for index in order.tolist()}
         for place, driver in driver_at.items():
             held_out[network, place] = driver in chosen
-    return held_out, few
+    return held_out, has_few_drivers
 
 
 def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
@@ -591,7 +591,7 @@ def _single_precision(batch: PairBatch, pair: Tensor) -> PairBatch:
 
 
 def _shards_of_pairs(pairs: int) -> Iterator[slice]:
-    """Yields which pairs are read at once."""
+    """Yields the rows of pairs that are read together, so that their windows fit into memory."""
     for first in range(0, pairs, _PAIRS_AT_ONCE):
         yield slice(first, min(first + _PAIRS_AT_ONCE, pairs))
 
@@ -644,7 +644,7 @@ def _known_as(
     time_gap: Tensor,
     in_queue: Tensor,
 ) -> Tensor:
-    """Chooses whose driver features each place's driver has, `(N, B)`, of the U pairs.
+    """Chooses which of the U pairs each place's driver has the driver features of, `(N, B)`.
 
     A simulated driver who leaves a queue stands for a recorded one of the same network, who was
     never seen at a light: the driver whose time gap has the same rank among recorded drivers. So

@@ -120,7 +120,7 @@ class EquilibriumTargets:
         )
 
     def only(self, networks: slice) -> EquilibriumTargets:
-        """Returns those of some networks."""
+        """Returns the relations of some of the networks."""
         return replace(self, gap=self.gap[networks], ratio=self.ratio[networks])
 
     def at(self, speed: Tensor) -> Tensor:

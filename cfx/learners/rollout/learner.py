@@ -258,7 +258,7 @@ def check_start(
 def begun(
     agent: Agent, network: PolicyNetwork, dataset: RolloutDataset
 ) -> tuple[PolicyNetwork, RolloutDataset]:
-    """Gives networks an agent's weights, and the data its scaler.
+    """Starts networks with a trained agent's weights; the data take over its scaler.
 
     Args:
         agent: with one network, of M.

@@ -65,6 +65,8 @@ _TOGETHER = 4_000
 """Trajectories of these paths that are simulated at once, which bounds the memory."""
 
 _COVERED = (_COVERING - 1) / (_COVERING + 1)
+"""Share of outcomes that lie within the range of so many paths, if the paths are drawn as they are:
+1 minus two cases of twenty."""
 
 _WARM_UP = 20
 """Gradient steps over which the learning rate rises."""

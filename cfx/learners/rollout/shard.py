@@ -249,7 +249,7 @@ def _weights(weights: Mapping[str, Tensor], networks: slice) -> dict[str, Tensor
 
 
 def _without_pairs(training_data: TrainingData) -> TrainingData:
-    """Returns what is said of networks; their pairs are left to the dataset."""
+    """Returns the training data without its pairs, which a shard's dataset has: it is pickled."""
     pairs, base = training_data.pairs, training_data.pairs.base
     if base is not None:
         base = base[:0]

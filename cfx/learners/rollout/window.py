@@ -52,11 +52,11 @@ class LoopState(NamedTuple):
     latent: Tensor
 
     def detached(self) -> LoopState:
-        """Returns the same values without what gradients would come back from."""
+        """Returns the same values, cut off from the graph of gradients."""
         return LoopState(*(value.detach() for value in self))
 
     def as_start(self) -> LoopState:
-        """Returns the same values as the first of a gradient's way, which ends there.
+        """Returns the same values as leaves of the graph, at which gradients end.
 
         Where gradients are recorded they flow through the first state too, as through all later
         ones: otherwise the window step would be compiled once more for it.

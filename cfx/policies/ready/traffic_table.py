@@ -68,8 +68,12 @@ def traffic_lines(measured: dict[str, Any]) -> list[str]:
 
 def outside_words(measured: dict[str, Any]) -> tuple[int, int]:
     """Returns how many values are outside of what is usual, and how many have usual values."""
-    compared = [row for row in measured["rows"] if row["usual"]]
-    return sum(1 for row in compared if row["outside"]), len(compared)
+    outside = compared = 0
+    for row in measured["rows"]:
+        if row["usual"]:
+            compared += 1
+            outside += bool(row["outside"])
+    return outside, compared
 
 
 def _listed(values: list[float]) -> str:

@@ -35,7 +35,11 @@ WORST_WITHOUT_CUT = -0.6
 """Improvements above this are never cut off, however far they lie from the others."""
 
 _FAR_OUT = 3.0
+"""Distances between the quartiles beyond which Tukey calls a value "far out" (Exploratory Data
+Analysis, 1977)."""
+
 _MARGIN = 0.07
+"""Share of the axis that stays empty at its ends."""
 
 
 @dataclass(frozen=True)
@@ -123,9 +127,10 @@ def improvement_axis(
     fence = min(float(q1 - _FAR_OUT * (q3 - q1)), WORST_WITHOUT_CUT)
     lowest = float(finite.min())
     # The mean and its interval stay in view as long as they do not dwarf the bars themselves.
-    near = [mark for mark in canvas.finite(marks) if mark > _FAR_OUT * fence]
+    finite_marks = canvas.finite(marks)
+    near = finite_marks[finite_marks > _FAR_OUT * fence]
     low = min([max(lowest, fence), 0.0, *near])
-    high = max([float(finite.max()), 0.0, *canvas.finite(marks)])
+    high = max([float(finite.max()), 0.0, *finite_marks])
     margin = _MARGIN * max(high - low, 0.1)
     if lowest >= fence:
         low -= margin
@@ -181,8 +186,10 @@ def _series(
     defined = np.flatnonzero(np.isfinite(values))
     order = defined[np.argsort(-values[defined], kind="stable")]
     ordered = values[order]
-    ids = tuple(str(pair_ids[index]) for index in order)
-    return ImprovementSeries(name, ids, ordered, np.maximum(ordered, low), ordered < low)
+    ids = np.array(pair_ids, dtype=object)[order]
+    return ImprovementSeries(
+        name, tuple(map(str, ids)), ordered, np.maximum(ordered, low), ordered < low
+    )
 
 
 _NAMED = 40

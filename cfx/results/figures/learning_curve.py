@@ -25,7 +25,10 @@ _COLUMNS = {
     "validation_loss": ("validation", colours.VALIDATION_COLOUR, (0, (5.0, 1.8))),
 }
 _MOST_POINTS = 250
+"""Of a curve: more lie closer together than a line is wide."""
+
 _LOGARITHMIC_FROM = 5.0
+"""Ratio of the largest to the smallest loss above which the axis is logarithmic."""
 
 
 def loss_quartiles(table: pd.DataFrame) -> dict[str, pd.DataFrame]:

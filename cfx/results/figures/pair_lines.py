@@ -94,7 +94,10 @@ def pair_panels(
         parameters: in the order in which the trajectory has them.
     """
     time = trajectory.time
-    present = [method for method in methods if method in trajectory.speed]
+    present = []
+    for method in methods:
+        if method in trajectory.speed:
+            present.append(method)
     speed_lines = [canvas.Line("leader", time, trajectory.leader_speed)]
     speed_lines += _lines(time, trajectory.real_speed, trajectory.speed, present)
     gap_lines = _lines(time, trajectory.real_gap, trajectory.gap, present)
@@ -131,20 +134,27 @@ def _signal_panel(
     collisions: tuple[tuple[str, float, float], ...] = (),
 ) -> Panel:
     """Chooses the axis by the lines that matter; a note says how far a default lies off them."""
-    low, high = _range(tuple(line for line in lines if line.method != "default"))
+    defaults, others = [], []
+    for line in lines:
+        if line.method == "default":
+            defaults.append(line)
+        else:
+            others.append(line)
+    low, high = _range(others)
     notes: list[tuple[str, bool]] = []
     if low is not None and high is not None:
-        defaults = [line.values for line in lines if line.method == "default"]
-        far = canvas.finite(np.concatenate([np.empty(0), *defaults]))
+        # At least 1 m/s or 1 m, so that rounding does not fill the panel of a steady pair.
         height = max(high - low, 1.0)
         lowest, highest = low - _ROOM * height, high + _ROOM * height
-        if len(far):
-            least, most = float(far.min()), float(far.max())
-            if most > highest:
-                notes.append((f"default up to {wording.number_text(most)} {unit} ↑", True))
-            if least < lowest:
-                notes.append((f"default down to {wording.number_text(least)} {unit} ↓", False))
-            low, high = min(low, max(least, lowest)), max(high, min(most, highest))
+        default_low, default_high = _range(defaults)
+        if default_low is not None and default_high is not None:
+            if default_high > highest:
+                notes.append((f"default up to {wording.number_text(default_high)} {unit} ↑", True))
+            if default_low < lowest:
+                text = f"default down to {wording.number_text(default_low)} {unit} ↓"
+                notes.append((text, False))
+            low = min(low, max(default_low, lowest))
+            high = max(high, min(default_high, highest))
         low, high = low - 0.06 * height, high + 0.06 * height
     title = wording.unit_label(name, unit)
     return Panel(title, lines, low, high, tuple(notes), collisions)
@@ -152,8 +162,11 @@ def _signal_panel(
 
 def _range(lines: Sequence[canvas.Line]) -> tuple[float | None, float | None]:
     """Returns the lowest and the highest value of the lines that are not hidden; None for none."""
-    visible = [line.values for line in lines if not line.hidden]
-    values = canvas.finite(np.concatenate([np.empty(0), *visible]))
+    visible = [np.empty(0)]
+    for line in lines:
+        if not line.hidden:
+            visible.append(line.values)
+    values = canvas.finite(np.concatenate(visible))
     if not len(values):
         return None, None
     return float(values.min()), float(values.max())
@@ -224,9 +237,10 @@ def _rows_of_two(figure: Figure, rows: int) -> list[list[Axes]]:
     """Returns two panels a row; on narrow paper each below the other."""
     if canvas.most_across(2) == 2:
         grid = figure.subplots(rows, 2, squeeze=False, sharex="row", width_ratios=(1.12, 1.0))
-        return [list(row) for row in grid]
-    figure.set_figheight(2 * figure.get_figheight())
-    return [list(row) for row in figure.subplots(2 * rows, 1).reshape(rows, 2)]
+    else:
+        figure.set_figheight(2 * figure.get_figheight())
+        grid = figure.subplots(2 * rows, 1).reshape(rows, 2)
+    return [list(row) for row in grid]
 
 
 @canvas.styled
@@ -269,8 +283,11 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     # The speeds take the cells that the parameters leave over, so that the grid has no hole.
     span = rows * columns - count
     speeds = figure.add_subplot(grid[0, :span])
-    shown = [line for line in pair.speed.lines if line.method in {"leader", "real", "policy"}]
-    canvas.draw_lines(speeds, shown)
+    lines = []
+    for line in pair.speed.lines:
+        if line.method in {"leader", "real", "policy"}:
+            lines.append(line)
+    canvas.draw_lines(speeds, lines)
     speeds.set_title(pair.speed.title)
     panels = [speeds]
     panels += _draw_parameters(speeds, grid, pair.parameters, first=span)
@@ -326,8 +343,16 @@ def _finish(figure: Figure, methods: Sequence[str], title: str | None = None) ->
 
 
 def _legend(figure: Figure, methods: Sequence[str], title: str | None = None) -> None:
-    visible = [method for method in methods if method not in canvas.HIDDEN]
-    canvas.method_legend(figure, ["real", "leader", *visible], title)
+    canvas.method_legend(figure, ["real", "leader", *_visible(methods)], title)
+
+
+def _visible(methods: Sequence[str]) -> list[str]:
+    """Returns the methods that figures show."""
+    visible = []
+    for method in methods:
+        if method not in canvas.HIDDEN:
+            visible.append(method)
+    return visible
 
 
 def draw_panel(axes: Axes, panel: Panel) -> None:
@@ -516,7 +541,7 @@ def chosen_pairs(
     is_calibration = "policy" not in result.shown_methods
     judged = "policy"
     if is_calibration:  # driver-specific parameters, which stand last, if there are any
-        judged = [method for method in result.shown_methods if method not in canvas.HIDDEN][-1]
+        judged = _visible(result.shown_methods)[-1]
     rows = result.pairs[result.pairs["method"] == judged]
     rows = rows[rows["pair_id"].isin(list(by_id))]
     gains = pd.Series(np.nan, index=rows["pair_id"].astype(str))
@@ -534,12 +559,12 @@ def chosen_pairs(
             ranked = RankedPair(pair.pair_id, pair.rank, improvement)
             best_and_worst.append((ranked, by_id[pair.pair_id]))
         return best_and_worst
-    wanted = [pair_id] if isinstance(pair_id, str) else list(pair_id)
+    ids = [pair_id] if isinstance(pair_id, str) else list(pair_id)
     chosen = []
-    for name in wanted:
+    for name in ids:
         if name not in by_id:
             hint = nearest(name, by_id)
-            raise ConfigError(f"pair '{name}' is not in this results.{hint}")
+            raise ConfigError(f"pair '{name}' is not in these results.{hint}")
         chosen.append((RankedPair(name, "", float(gains[name])), by_id[name]))
     return chosen
 
@@ -557,12 +582,12 @@ def _errors(result: Result, pair_id: str, signal: str) -> dict[str, float]:
 
 def _errors_text(result: Result, pair_id: str, signal: str, unit: str) -> str:
     """Returns a title such as "RMSE of speed (m/s): default 1.02, policy 0.31"."""
-    listed = []
-    for method, error in _errors(result, pair_id, signal).items():
-        if method not in canvas.HIDDEN:
-            value = f"{error:.2f}" if np.isfinite(error) else "none"
-            listed.append(f"{wording.short_label(method)} {value}")
-    return f"RMSE of {signal} ({unit}): {', '.join(listed)}"
+    errors = _errors(result, pair_id, signal)
+    texts = []
+    for method in _visible(list(errors)):
+        value = f"{errors[method]:.2f}" if np.isfinite(errors[method]) else "none"
+        texts.append(f"{wording.short_label(method)} {value}")
+    return f"RMSE of {signal} ({unit}): {', '.join(texts)}"
 
 
 @dataclass(frozen=True)
@@ -602,9 +627,11 @@ def rank_pairs(
     values = np.asarray(improvements, dtype=np.float64)
     order = np.argsort(-np.where(np.isfinite(values), values, -np.inf), kind="stable")
     defined = int(np.isfinite(values).sum())
-    if not defined:
-        return tuple(RankedPair(str(pair), "", float("nan")) for pair in pair_ids[:count])
     chosen = []
+    if not defined:
+        for pair_id in pair_ids[:count]:
+            chosen.append(RankedPair(str(pair_id), "", float("nan")))
+        return tuple(chosen)
     for place in evenly_spread(defined, count):
         index = int(order[place])
         rank = _rank(place, defined, count)
@@ -616,11 +643,12 @@ def evenly_spread(available: int, count: int) -> list[int]:
     """Returns up to `count` places from the first to the last of `available`; of one the middle."""
     if count == 1 or available == 1:
         return [available // 2]
-    wanted = min(count, available)
+    count = min(count, available)
     places = []
-    for k in range(wanted):
-        # The exact middle of an even number is the later one, as for a single place.
-        places.append((2 * k * (available - 1) + wanted - 1) // (2 * (wanted - 1)))
+    for k in range(count):
+        # k (available - 1) / (count - 1), rounded half up in whole numbers: of an even number the
+        # middle is the later one, as for a single place.
+        places.append((2 * k * (available - 1) + count - 1) // (2 * (count - 1)))
     return places
 
 

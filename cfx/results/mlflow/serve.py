@@ -105,8 +105,9 @@ def serve(uri: str | None, port: int, *, open_browser: bool = False) -> None:
 
 
 def _first_link(lines: Sequence[str]) -> str:
-    words = " ".join(lines).split()
-    return next(word for word in words if word.startswith("http://"))
+    """Returns the first link in lines that people read."""
+    _, scheme, text = " ".join(lines).partition("http://")
+    return scheme + text.split()[0]
 
 
 def _become_server(store: str, port: int) -> None:
@@ -184,9 +185,8 @@ def _close_abandoned(store: str) -> None:
     from cfx.results.mlflow.tracker import close_abandoned
 
     with translate_errors(f"close abandoned runs in {store}"):
-        names = [experiment.name for experiment in _client(store).search_experiments()]
-        for name in names:
-            opened = open_store(store, name)
+        for experiment in _client(store).search_experiments():
+            opened = open_store(store, experiment.name)
             with opened.locked():
                 close_abandoned(opened)
 
@@ -231,7 +231,8 @@ def _sweep_lines(client: MlflowClient, parent: Any, address: str) -> list[str]:
     title = f"sweep {name}, {_began(parent)}: {len(runs)} jobs"
     if groups:
         title += _best(groups[0], error)
-    tested = {run.data.tags.get(TESTED, "") for run in runs} - {""}
+    tested = {run.data.tags.get(TESTED, "") for run in runs}
+    tested.discard("")  # of jobs that did not end
     if len(tested) > 1:
         title += f"; tested on {len(tested)} sets of pairs, which do not compare ({TESTED})"
     lines = [
@@ -255,7 +256,8 @@ def _over_seeds(runs: Sequence[Any], error: str) -> list[list[Any]]:
     """
     groups: dict[tuple[tuple[str, str], ...], list[Any]] = {}
     for run in runs:
-        settings = {key: value for key, value in run.data.params.items() if key != "seed"}
+        settings = dict(run.data.params)
+        settings.pop("seed", None)
         groups.setdefault(tuple(sorted(settings.items())), []).append(run)
     return sorted(groups.values(), key=lambda group: _mean_error(group, error))
 
@@ -289,7 +291,10 @@ def _experiment_lines(client: MlflowClient, names: dict[str, str], address: str)
     """Returns a page for each experiment that holds jobs, or for each if none does."""
     from cfx.results.mlflow.tracker import common_error
 
-    used = [name for name in names if client.search_runs([name], max_results=1)]
+    used = []
+    for experiment in names:
+        if client.search_runs([experiment], max_results=1):
+            used.append(experiment)
     lines = []
     for experiment in used or names:
         chosen = "tags.`cfx.sweep_parent` IS NULL"

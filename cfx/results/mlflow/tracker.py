@@ -153,7 +153,7 @@ class MlflowTracker(Tracker):
         """
         store = open_store(uri, experiment)
         cleaned = _clean_parameters(parameters)
-        every = {
+        all_tags = {
             **provenance.git_state(Path.cwd()),
             **provenance.plugin_tags(plugins or {}),
             **provenance.process_tags(),
@@ -169,10 +169,10 @@ class MlflowTracker(Tracker):
             parent_id = None
             if sweep is not None:
                 parent_id = _sweep_parent(store, sweep)
-                every |= {"cfx.sweep": _safe(sweep), "mlflow.parentRunId": parent_id}
-            run_id = _begin(store, run_name, cleaned, every)
+                all_tags |= {"cfx.sweep": _safe(sweep), "mlflow.parentRunId": parent_id}
+            run_id = _begin(store, run_name, cleaned, all_tags)
             if sweep is not None:
-                _replace_earlier(store, run_id, every)
+                _replace_earlier(store, run_id, all_tags)
         data = (tags or {}).get("data", "")
         tracker = cls(store, run_id, run_name, sweep, parent_id, plugins or {}, data)
         try:
@@ -228,7 +228,7 @@ class MlflowTracker(Tracker):
         profile = {
             "pairs": len(pairs),
             "drivers": len(set(pairs.drivers)),
-            "frames": sum(len(pair) for pair in pairs),
+            "frames": pairs.frames,
             "time_step_s": pairs.dt,
             "fingerprint": pairs.fingerprint,
         }
@@ -380,7 +380,8 @@ def _fitted(result: Result) -> dict[str, float]:
         return {}
     fits = result.tables["fits"]
     means = fits[fits["method"] == "driver_specific"].mean(numeric_only=True)
-    return fitted_errors({str(name).removeprefix("train_"): mean for name, mean in means.items()})
+    means.index = means.index.astype(str).str.removeprefix("train_")
+    return fitted_errors(dict(means))
 
 
 def _tested(result: Result) -> str:
@@ -476,7 +477,8 @@ def _example(folder: Path, pairs: PairSet | None) -> dict[str, Any]:
 
 def common_error(runs: Sequence[Any]) -> str:
     """Returns the metric by which runs are sorted: what all minimised, else the RMSE of speed."""
-    errors = {run.data.tags[ERROR] for run in runs if ERROR in run.data.tags}
+    errors = {run.data.tags.get(ERROR) for run in runs}
+    errors.discard(None)  # of runs that did not end
     return errors.pop() if len(errors) == 1 else DEFAULT_ERROR
 
 
@@ -545,11 +547,14 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
             client.delete_tag(run.info.run_id, "cfx.failure")
     else:
         # With its tags from the start: whoever finds it after a kill knows whose it was.
-        whose = {tag.key: tag.value for tag in _tags(tags)}
-        run, logged = client.create_run(store.experiment_id, run_name=name, tags=whose), {}
+        cleaned = {tag.key: tag.value for tag in _tags(tags)}
+        run, logged = client.create_run(store.experiment_id, run_name=name, tags=cleaned), {}
     run_id = str(run.info.run_id)
     try:
-        missing = [Param(key, value) for key, value in parameters.items() if key not in logged]
+        missing = []
+        for key, value in parameters.items():
+            if key not in logged:
+                missing.append(Param(key, value))
         client.log_batch(run_id, params=missing, tags=_tags(tags))
         folder = _local(run.info.artifact_uri)
         if folder is not None:
@@ -607,8 +612,8 @@ def close_abandoned(store: Store) -> None:
     A killed process cannot do it itself. Call under the lock.
     """
     host = _safe(provenance.process_tags()["cfx.host"])
-    mine = f"attributes.status = 'RUNNING' and tags.`cfx.host` = '{host}'"
-    for run in store.client.search_runs([store.experiment_id], mine, max_results=1000):
+    running_here = f"attributes.status = 'RUNNING' and tags.`cfx.host` = '{host}'"
+    for run in store.client.search_runs([store.experiment_id], running_here, max_results=1000):
         if not provenance.is_alive(run.data.tags):
             store.client.set_tag(
                 run.info.run_id, "cfx.failure", "the process ended without closing the run"

@@ -47,6 +47,7 @@ _VECTOR_MATH = ("-DVECTOR_MATH", "-lmvec", "-lm", "-Wl,-z,defs")
 place; tried first. Where it has none of them, linking fails, and they are computed one by one."""
 
 _TIMEOUT_S = 120
+"""A compiler that takes longer hangs, s."""
 
 
 @functools.cache
@@ -106,7 +107,7 @@ def remembered(key: str | None, make: Callable[[], str]) -> str:
 
 @functools.cache
 def _tell() -> None:
-    """Says once what takes a while the first time."""
+    """Logs, once in a process, that code is compiled, which takes seconds the first time."""
     log.info("Compiling for this processor; what is compiled is kept in %s", cache_folder())
 
 

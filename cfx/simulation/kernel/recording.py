@@ -48,7 +48,7 @@ def record_function(
         names.append(tuple(f"in{number}_{column}" for column in range(width)))
 
     def of_columns(*values: Tensor) -> Sequence[Tensor]:
-        """Calls the function with columns put together: what is recorded is scalar."""
+        """Calls the function on tables put together from columns, each an input of its own."""
         arguments, first = [], 0
         for width in widths:
             arguments.append(torch.stack(values[first : first + width], -1))

@@ -99,7 +99,11 @@ class CompiledRows:
     def __init__(
         self, function: Callable[..., Sequence[Tensor]], widths: Sequence[int], key: object = None
     ) -> None:
-        self._used = [number for number, width in enumerate(widths) if width > 0]
+        self._used, used_widths = [], []
+        for number, width in enumerate(widths):
+            if width > 0:  # an empty table has no memory that C++ could read
+                self._used.append(number)
+                used_widths.append(width)
         lasting = None
         if key is not None:
             lasting = content_key([key, list(widths), folder_hash(__file__), torch.__version__])
@@ -111,7 +115,6 @@ class CompiledRows:
             return function(*arguments)
 
         def source() -> str:
-            used_widths = [widths[number] for number in self._used]
             return _source(record_function(of_used, used_widths, torch.float64))
 
         if compiler.find_compiler() is None:
@@ -122,8 +125,9 @@ class CompiledRows:
         self._run = library.run
 
     def __call__(self, count: int, inputs: Sequence[Rows], outputs: Sequence[Rows]) -> None:
-        numbers: list[int] = []
-        for table, rows in (*(inputs[number] for number in self._used), *outputs):
+        used_inputs = [inputs[number] for number in self._used]
+        numbers: list[int] = []  # of each table its address, its strides and its rows' address
+        for table, rows in (*used_inputs, *outputs):
             assert table.dtype == torch.float64
             numbers += (table.data_ptr(), *_strides(table), 0 if rows is None else rows.data_ptr())
         self._run((ctypes.c_long * len(numbers))(*numbers), ctypes.c_long(count))

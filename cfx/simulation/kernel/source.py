@@ -195,15 +195,18 @@ def _constant_in_time(program: StepProgram, varied: Sequence[bool]) -> list[Assi
     constant = set(parameter_names(len(varied)))
     constant_statements = []
     for statement in program.statements:
-        names = [operand for operand in statement.operands if not operand.startswith("real(")]
-        if names and constant.issuperset(names) and not statement.is_condition:
+        names = set()
+        for operand in statement.operands:
+            if not operand.startswith("real("):  # a number, which is constant anyway
+                names.add(operand)
+        if names and names <= constant and not statement.is_condition:
             constant.add(statement.name)
             constant_statements.append(statement)
     return constant_statements
 
 
 def _before(constant: Sequence[Assignment], varied: Sequence[bool]) -> list[str]:
-    """Returns what computes these statements once for each candidate, before time passes."""
+    """Returns the loop over candidates that computes these statements, before that over time."""
     if not constant:
         return []
     lines = [f"    real {statement.name}s[BLOCK];" for statement in constant]
@@ -268,7 +271,7 @@ def _loop(
 
 
 def _added(terms: int, *, summed: bool) -> list[str]:
-    """Returns what adds the terms of a frame to their sums, or keeps them alone."""
+    """Returns the statements that add a frame's terms to their sums, or keep each frame's apart."""
     sign = "="
     if summed:
         sign = "+="
@@ -276,7 +279,7 @@ def _added(terms: int, *, summed: bool) -> list[str]:
 
 
 def _written(terms: int, *, corrected: bool) -> list[str]:
-    """Returns what writes the terms of single frames, and corrects the states after them."""
+    """Returns the statements that write single frames' terms, and correct the states after them."""
     lines = ["      if ((t + 1) % every == 0) {"]
     for k in range(terms):
         row = f"{k} * rows + (t + 1) / every - 1"
@@ -297,7 +300,7 @@ def _written(terms: int, *, corrected: bool) -> list[str]:
 
 
 def _turned(width: int, shift: int) -> list[str]:
-    """Returns where a step finds the memory and where it leaves it."""
+    """Returns the statements that set where a step reads the model's memory and writes it."""
     lines = []
     if shift:
         end = f"columns + {_room(width, shift)}"

@@ -86,9 +86,13 @@ def _prepare(figure: Figure) -> list[str]:
         if points > _MANY_POINTS:
             artist.set_rasterized(True)
     for axes in figure.axes:
-        pale = [line for line in axes.lines if line.get_alpha() is not None]
-        for line in pale if len(pale) > _MANY_LINES else ():
-            line.set_rasterized(True)
+        pale = []
+        for line in axes.lines:
+            if line.get_alpha() is not None:
+                pale.append(line)
+        if len(pale) > _MANY_LINES:
+            for line in pale:
+                line.set_rasterized(True)
     return hovers
 
 

@@ -26,7 +26,11 @@ class Runs:
 
 def of_purpose(jobs: Iterable[Result], *purposes: Purpose) -> list[Result]:
     """Returns the jobs that have one of these purposes."""
-    return [job for job in jobs if job.purpose in purposes]
+    chosen = []
+    for job in jobs:
+        if job.purpose in purposes:
+            chosen.append(job)
+    return chosen
 
 
 def are_calibrations(jobs: Iterable[Result]) -> bool:

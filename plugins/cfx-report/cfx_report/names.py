@@ -39,7 +39,7 @@ def named(jobs: Sequence[Result]) -> tuple[Result, ...]:
     """Gives every job a short name: its driving model, and what else differs between the jobs."""
     columns = _columns(jobs, ())
     if len(columns) > _MOST:
-        columns = _telling(columns)
+        columns = _distinguishing(columns)
     names = _joined(columns)
     renamed = []
     for k, job in enumerate(jobs):
@@ -52,30 +52,34 @@ def named(jobs: Sequence[Result]) -> tuple[Result, ...]:
 
 def shortest_names(jobs: Sequence[Result], ignored: Sequence[str] = ()) -> list[str]:
     """Returns names of as few parts as tell apart what `differences` tells apart."""
-    return _joined(_telling(_columns(jobs, ignored)))
+    return _joined(_distinguishing(_columns(jobs, ignored)))
 
 
 def _joined(columns: Sequence[Sequence[str]]) -> list[str]:
     """Returns a name for each job: its values in the columns, without the absent ones."""
     names = []
     for values in zip(*columns, strict=True):
-        names.append(SEPARATOR.join(value for value in values if value))
+        names.append(SEPARATOR.join(filter(None, values)))
     return names
 
 
-def _telling(columns: Sequence[list[str]]) -> list[list[str]]:
-    """Returns the first column, and as few others as tell apart what all columns tell apart."""
-    left, kept = list(range(1, len(columns))), [0]
-    while left and _kinds(columns, kept) < _kinds(columns, range(len(columns))):
-        best = max(left, key=lambda column: _kinds(columns, [*kept, column]))
-        left.remove(best)
-        kept.append(best)
-    return [columns[column] for column in sorted(kept)]
+def _distinguishing(columns: Sequence[list[str]]) -> list[list[str]]:
+    """Returns the first column, and as few others as tell apart what all columns tell apart.
+
+    Greedy: each time the column is added that tells most jobs apart.
+    """
+    chosen, candidates = [0], list(range(1, len(columns)))
+    while candidates and _distinct_rows(columns, chosen) < len(set(zip(*columns, strict=True))):
+        best = max(candidates, key=lambda number: _distinct_rows(columns, [*chosen, number]))
+        candidates.remove(best)
+        chosen.append(best)
+    return [columns[number] for number in sorted(chosen)]
 
 
-def _kinds(columns: Sequence[Sequence[str]], chosen: Sequence[int]) -> int:
-    """Returns how many jobs some columns tell apart."""
-    return len(set(zip(*(columns[column] for column in chosen), strict=True)))
+def _distinct_rows(columns: Sequence[Sequence[str]], numbers: Sequence[int]) -> int:
+    """Returns how many different rows the columns of these numbers have."""
+    chosen = [columns[number] for number in numbers]
+    return len(set(zip(*chosen, strict=True)))
 
 
 def differences(jobs: Sequence[Result], ignored: Sequence[str] = ()) -> list[list[str]]:
@@ -90,7 +94,7 @@ def differences(jobs: Sequence[Result], ignored: Sequence[str] = ()) -> list[lis
     """
     parts = []
     for values in zip(*_columns(jobs, ignored), strict=True):
-        parts.append([value for value in values if value])
+        parts.append(list(filter(None, values)))
     return parts
 
 
@@ -106,9 +110,12 @@ def _columns(jobs: Sequence[Result], ignored: Sequence[str]) -> list[list[str]]:
     for key in keys:
         counts = key not in ignored and not key.startswith(_NO_DIFFERENCE)
         if counts and not key.endswith(".name") and _differs(key, jobs, flat):
-            columns.append(_said(key, flat))
-    first, *others = columns
-    return [first, *(column for column in others if len(set(column)) > 1)]
+            columns.append(_in_words(key, flat))
+    differing = columns[:1]  # the models, also where all jobs have the same
+    for column in columns[1:]:
+        if len(set(column)) > 1:
+            differing.append(column)
+    return differing
 
 
 def _differs(key: str, jobs: Sequence[Result], flat: Sequence[Mapping[str, Any]]) -> bool:
@@ -121,22 +128,27 @@ def _differs(key: str, jobs: Sequence[Result], flat: Sequence[Mapping[str, Any]]
     return any(len(values) > 1 for values in by_peer.values())
 
 
-def _said(key: str, flat: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Returns a setting of each job in words; long values without what they all begin with."""
-    values = [str(settings[key]) if key in settings else "" for settings in flat]
-    longest = max(map(len, values))
-    same = wording.common_prefix([value for value in values if value])
-    said = []
-    if longest > _LONG and same:
-        values = [value and f"…{value.removeprefix(same)}" for value in values]
+def _in_words(key: str, flat: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Returns a setting of each job in words; "" for a job that does not have it.
+
+    Long values stand without what they all begin with.
+    """
+    values = [str(settings.get(key, "")) for settings in flat]
+    prefix = ""
+    if max(map(len, values)) > _LONG:
+        prefix = wording.common_prefix(list(filter(None, values)))
+    words = []
     for value in values:
+        shown = value
+        if value and prefix:
+            shown = f"…{value.removeprefix(prefix)}"
         if not value or key == "style.cluster":
-            said.append(value)
+            words.append(shown)
         elif key == "seed":
-            said.append(f"seed {value}")
+            words.append(f"seed {shown}")
         else:
-            said.append(f"{key.partition('.')[2] or key}={value}")
-    return said
+            words.append(f"{key.partition('.')[2] or key}={shown}")
+    return words
 
 
 @dataclass(frozen=True)
@@ -173,12 +185,17 @@ def rows_of(jobs: Sequence[Result], group_by: str | None = None) -> tuple[Row, .
     Raises:
         ConfigError: no job has the setting `group_by`.
     """
-    ignored = () if group_by is None else (group_by,)
-    if group_by is not None and not any(group_by in flatten(dict(job.config)) for job in jobs):
-        raise ConfigError(
-            f"--group-by {group_by}: no job has this setting; name one as config.yaml does, for"
-            " instance seed or data.max_pairs"
-        )
+    ignored: tuple[str, ...] = ()
+    if group_by is not None:
+        ignored = (group_by,)
+        settings: set[str] = set()
+        for job in jobs:
+            settings.update(flatten(dict(job.config)))
+        if group_by not in settings:
+            raise ConfigError(
+                f"--group-by {group_by}: no job has this setting; name one as config.yaml does, for"
+                " instance seed or data.max_pairs"
+            )
     names = shortest_names(jobs, ignored)
     by_name: dict[str, list[Result]] = {}
     for number, (name, job) in enumerate(zip(names, jobs, strict=True)):
@@ -205,10 +222,10 @@ def methods_of(rows: Sequence[Row]) -> list[str]:
     for row in rows:
         for job in row.jobs:
             methods |= dict.fromkeys(job.shown_methods)
+    last = "policy" if any_adapts(rows) else "driver_specific"  # what the jobs are judged by
     methods.pop("policy", None)
-    if any_adapts(rows):
-        return [*methods, "policy"]
-    return [method for method in methods if method != "driver_specific"] + ["driver_specific"]
+    methods.pop(last, None)
+    return [*methods, last]
 
 
 def any_adapts(rows: Sequence[Row]) -> bool:
@@ -225,5 +242,8 @@ def baselines_of(rows: Sequence[Row]) -> list[str]:
     jobs: list[Result] = []
     for row in rows:
         jobs += row.jobs
-    baselines = any_baselines(jobs)
-    return [baseline for baseline in baselines if baseline in {"driver_specific", "pooled"}]
+    baselines = []
+    for baseline in any_baselines(jobs):
+        if baseline in {"driver_specific", "pooled"}:
+            baselines.append(baseline)
+    return baselines

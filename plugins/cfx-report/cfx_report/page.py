@@ -191,7 +191,7 @@ def _few(jobs: Sequence[Result]) -> list[str]:
 
 def _counts(jobs: Sequence[Result]) -> str:
     """Returns in how many jobs the policy is closer, over each of two baselines."""
-    said = []
+    sentences = []
     for baseline, against in (
         ("driver_specific", f"Of {len(jobs)} jobs"),
         ("pooled", "against pooled calibration"),
@@ -201,11 +201,9 @@ def _counts(jobs: Sequence[Result]) -> str:
             if baseline in job.baselines():
                 sides.append(_side(job, baseline))
         if sides:
-            counts = ", ".join(
-                f"{side} in {sides.count(side)}" for side in ("yes", "no", "undecided")
-            )
-            said.append(f"{against}: {counts}")
-    return "; ".join(said)
+            yes, no, undecided = map(sides.count, ("yes", "no", "undecided"))
+            sentences.append(f"{against}: yes in {yes}, no in {no}, undecided in {undecided}")
+    return "; ".join(sentences)
 
 
 def _reference(job: Result) -> str:
@@ -264,9 +262,9 @@ def _gain(job: Result, baseline: str) -> str:
     low, high = improvement.ci95_low, improvement.ci95_high
     if not np.isfinite(improvement.geometric):
         return "not defined"
-    sure = "no interval for a single driver"
+    certainty = "no interval for a single driver"
     if np.isfinite(low):
-        sure = f"95 % interval {wording.percent(low, 1)} to {wording.percent(high, 1)}"
-    said = f"{wording.percent(improvement.geometric, 1)} ({sure})"
+        certainty = f"95 % interval {wording.percent(low, 1)} to {wording.percent(high, 1)}"
+    gain = f"{wording.percent(improvement.geometric, 1)} ({certainty})"
     note = headline.summaries_disagree(improvement.geometric, improvement.ratio_of_means)
-    return f"{said}, {note}" if note else said
+    return f"{gain}, {note}" if note else gain

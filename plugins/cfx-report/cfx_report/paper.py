@@ -74,7 +74,9 @@ def frame(rows: Sequence[Row]) -> pd.DataFrame:
             if len(row.jobs) == 1:
                 for end in ("ci95_low", "ci95_high"):
                     values[f"{name}/{end}"] = row.improvements(end, baseline)[0]
-        values["version"] = ", ".join(sorted({job.version for job in row.jobs if job.version}))
+        versions = {job.version for job in row.jobs}
+        versions.discard("")
+        values["version"] = ", ".join(sorted(versions))
         values["command"] = "; ".join(_command(job) for job in row.jobs)
         table.append(values)
     return pd.DataFrame(table)
@@ -107,8 +109,8 @@ def latex(rows: Sequence[Row]) -> str:
     comments = ["% Needs \\usepackage{booktabs}."]
     for row in rows:
         for job in row.jobs:
-            said = f"cfx {job.version}: {_command(job)}".replace("\n", " ")
-            comments.append(f"% {row.name}: {said}")
+            origin = f"cfx {job.version}: {_command(job)}".replace("\n", " ")
+            comments.append(f"% {row.name}: {origin}")
     return "\n".join([*comments, body, *_parameter_tables(rows)])
 
 

@@ -166,7 +166,7 @@ def _words(text: str, option: str, allowed: Sequence[str]) -> tuple[str, ...]:
     """
     from cfx.errors import nearest
 
-    words = tuple(word.strip() for word in text.split(",") if word.strip())
+    words = tuple(filter(None, map(str.strip, text.split(","))))
     for word in words or ("",):
         if word not in allowed:
             raise ConfigError(

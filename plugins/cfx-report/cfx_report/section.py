@@ -181,7 +181,11 @@ class Sheet:
 
     def explained(self) -> list[Column[Any]]:
         """Returns the columns that have something to explain."""
-        return [column for column in self.columns if column.meaning]
+        explained = []
+        for column in self.columns:
+            if column.meaning:
+                explained.append(column)
+        return explained
 
 
 def text(value: object) -> Cell:
@@ -223,22 +227,24 @@ def method_cell(method: str) -> Cell:
 
 def tested(jobs: Iterable[Result]) -> str:
     """Returns which frames are tested, for instance "the last 20 % of each pair's frames"."""
-    splits = sorted({job.split for job in jobs if math.isfinite(job.split)})
+    splits = set()
+    for job in jobs:
+        if math.isfinite(job.split):
+            splits.add(job.split)
     if not splits:
         return "the test part of each pair's frames"
-    if splits == [1.0]:
+    if splits == {1.0}:
         return "all of each pair's frames, which were calibrated on"
-    parts = " or ".join(f"{100 * (1 - split):.3g}" for split in splits)
-    return f"the last {parts} % of each pair's frames"
+    percentages = " or ".join(f"{100 * (1 - split):.3g}" for split in sorted(splits))
+    return f"the last {percentages} % of each pair's frames"
 
 
 def methods_explained(methods: Iterable[str]) -> str:
     """Returns what each method is, as one sentence."""
-    parts = [
-        f"{wording.short_label(method)}: {wording.explained(method)}"
-        for method in dict.fromkeys(methods)
-    ]
-    return f"{'; '.join(parts)}."
+    explanations = []
+    for method in dict.fromkeys(methods):
+        explanations.append(f"{wording.short_label(method)}: {wording.explained(method)}")
+    return f"{'; '.join(explanations)}."
 
 
 def job_names(jobs: Sequence[Result]) -> str:

@@ -153,11 +153,10 @@ def labels_of(
     drawn = {}
     for pair_id in (candidates[place] for place in places):
         rows = labels[ids == pair_id].sort_values("time_s")
-        fixed = {
-            f"fixed_{name}": float(driver_specific.loc[pair_id, f"parameter_{name}"])
-            for name in names
-        }
-        drawn[pair_id] = rows.assign(weight=(rows["sensitivity"] / scale).clip(0, 1), **fixed)
+        rows = rows.assign(weight=(rows["sensitivity"] / scale).clip(0, 1))
+        for name in names:
+            rows[f"fixed_{name}"] = float(driver_specific.loc[pair_id, f"parameter_{name}"])
+        drawn[pair_id] = rows
     return drawn
 
 
@@ -245,7 +244,10 @@ def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis
         labels: as `labels_of` returns it for the pair.
         axes: the tuned parameters.
     """
-    shown = [axis for axis in axes if f"fixed_{axis.name}" in labels]
+    shown = []
+    for axis in axes:
+        if f"fixed_{axis.name}" in labels:
+            shown.append(axis)
     figure = canvas.blank(1.0 + 1.15 * (len(shown) + 1))
     grid = figure.subplots(len(shown) + 1, 1, sharex=True)
     times = labels["time_s"].to_numpy(dtype=float)

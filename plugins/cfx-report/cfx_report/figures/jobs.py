@@ -163,7 +163,10 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: improvement_bars.Improve
     present: set[str] = set()
     for group in groups:
         present |= set(group.clusters)
-    order = [cluster for cluster in style.CLUSTERS if cluster in present]
+    order = []
+    for cluster in style.CLUSTERS:
+        if cluster in present:
+            order.append(cluster)
     width = 0.8 / max(len(groups), 1)
     handles = []
     for k, group in enumerate(groups):

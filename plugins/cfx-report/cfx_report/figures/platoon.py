@@ -165,8 +165,11 @@ class PlatoonSpeeds(JobFigure):
         table = result.tables.get("platoon")
         if table is None:
             return None
-        present = set(table["method"])
-        methods = [method for method in result.shown_methods if method in present]
+        simulated = set(table["method"])
+        methods = []
+        for method in result.shown_methods:
+            if method in simulated:
+                methods.append(method)
         if not methods:
             return None
         stable = {}

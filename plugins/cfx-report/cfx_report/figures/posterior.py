@@ -62,7 +62,11 @@ def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
     for place in grid.flat:
         for handle, text in zip(*place.get_legend_handles_labels(), strict=True):
             handles.setdefault(text, handle)
-    canvas.legend_above(figure, [handles[words] for words, *_ in _KINDS if words in handles])
+    in_order = []
+    for words, _, _ in _KINDS:
+        if words in handles:
+            in_order.append(handles[words])
+    canvas.legend_above(figure, in_order)
     figure.supxlabel(
         canvas.wrapped(
             f"{wording.plural(len(rows), 'pair')}, in the order of their medians (dots); above each"
@@ -77,19 +81,18 @@ def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
 def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
     ordered = rows.sort_values(f"median_{axis.name}")
     number = np.arange(len(ordered))
-    good = are_reliable(ordered).to_numpy(dtype=bool)
+    reliable = are_reliable(ordered).to_numpy(dtype=bool)
     determined = ordered[f"contraction_{axis.name}"].to_numpy(dtype=float) >= MIN_NARROWING
-    kinds = (good & determined, good & ~determined, ~good)
-    low, middle, high = (
-        ordered[f"{kind}_{axis.name}"].to_numpy(dtype=float) for kind in ("low", "median", "high")
-    )
+    kinds = (reliable & determined, reliable & ~determined, ~reliable)
+    columns = [f"low_{axis.name}", f"median_{axis.name}", f"high_{axis.name}"]
+    low, middle, high = ordered[columns].to_numpy(dtype=float).T
     size = max(0.8, min(3.0, 120.0 / len(ordered)))
-    for which, (words, method, opacity) in zip(kinds, _KINDS, strict=True):
-        if which.any():
+    for is_of_kind, (words, method, opacity) in zip(kinds, _KINDS, strict=True):
+        if is_of_kind.any():
             place.vlines(
-                number[which],
-                low[which],
-                high[which],
+                number[is_of_kind],
+                low[is_of_kind],
+                high[is_of_kind],
                 color=colours.colour_of(method),
                 alpha=opacity,
                 linewidth=size,
@@ -109,8 +112,8 @@ def _intervals(place: Axes, rows: pd.DataFrame, axis: ParameterAxis) -> None:
         for bound in (axis.low, axis.high):
             place.axhline(bound, color=colours.EDGE, linestyle="--", linewidth=1)
     place.set_xticks([])
-    share = int((good & determined).sum())
-    place.set_title(f"{wording.unit_label(axis.name, axis.unit)}: {share} of {len(ordered)}")
+    count = int((reliable & determined).sum())
+    place.set_title(f"{wording.unit_label(axis.name, axis.unit)}: {count} of {len(ordered)}")
 
 
 @canvas.styled
@@ -155,10 +158,10 @@ def draw_pairs(
         grid[number, 0].set_ylabel(named if number else "density", fontsize=canvas.points(9))
     handles, _ = grid[0, 0].get_legend_handles_labels()
     canvas.legend_above(figure, handles)
-    said = canvas.wrapped(
+    caption = canvas.wrapped(
         f"{wording.shortened(pair_id)}: {wording.plural(len(draws), 'draw')} from the posterior"
     )
-    figure.supxlabel(said, fontsize=canvas.points(10.5), color=colours.INK)
+    figure.supxlabel(caption, fontsize=canvas.points(10.5), color=colours.INK)
     return figure
 
 
@@ -203,9 +206,8 @@ def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
     figure = canvas.blank(3.6)
     place = figure.subplots()
     time = rows["time_s"].to_numpy(dtype=float)
-    low, middle, high, measured = (
-        rows[name].to_numpy(dtype=float) for name in ("low", "median", "high", "measured")
-    )
+    columns = ["low", "median", "high", "measured"]
+    low, middle, high, measured = rows[columns].to_numpy(dtype=float).T
     colour = colours.colour_of("driver_specific")
     place.fill_between(
         time,
@@ -218,23 +220,21 @@ def draw_fan(pair_id: str, rows: pd.DataFrame) -> Figure:
     )
     place.plot(time, middle, color=colour, label="median")
     place.plot(time, measured, color=colours.INK, label="recorded")
-    after = ~rows["calibrated_on"].to_numpy(dtype=bool)
-    if after.any():
-        held = (low <= measured) & (measured <= high)
-        place.axvline(time[after][0], color=colours.EDGE, linestyle="--", linewidth=1)
-        share = held[after].mean()
-        say = (
-            f"{wording.shortened(pair_id)}: without noise up to the dashed line; after it forecasts"
-            f" with noise, which hold {share:.0%} of the recording"
+    held_out = ~rows["calibrated_on"].to_numpy(dtype=bool)
+    caption = wording.shortened(pair_id)
+    if held_out.any():
+        is_inside = (low <= measured) & (measured <= high)
+        place.axvline(time[held_out][0], color=colours.EDGE, linestyle="--", linewidth=1)
+        caption += (
+            ": without noise up to the dashed line; after it forecasts with noise, which hold"
+            f" {is_inside[held_out].mean():.0%} of the recording"
         )
-    else:
-        say = wording.shortened(pair_id)
     place.set_xlabel("time from the start of the pair (s)")
     signal = str(rows["signal"].iloc[0])
     place.set_ylabel(wording.unit_label(signal, {"speed": "m/s", "gap": "m"}[signal]))
     handles, _ = place.get_legend_handles_labels()
     canvas.legend_above(figure, handles)
-    figure.supxlabel(canvas.wrapped(say), fontsize=canvas.points(10.5), color=colours.INK)
+    figure.supxlabel(canvas.wrapped(caption), fontsize=canvas.points(10.5), color=colours.INK)
     return figure
 
 

@@ -63,32 +63,32 @@ def _panel(axes: Axes, values: canvas.Array, shown: Sequence[style.Group], title
     sites = list(dict.fromkeys(group.site for group in shown))
     scatter = np.random.default_rng(0)
     for place, group in enumerate(shown):
-        mine = values[group.chosen & np.isfinite(values)]
-        whole = group.driver_type == style.ALL_TYPES
-        colour = (
-            colours.JOB_COLOURS[sites.index(group.site) % len(colours.JOB_COLOURS)]
-            if whole
-            else _TYPE_COLOUR
-        )
-        if len(mine) >= _VIOLIN and np.ptp(mine) > 0:
+        of_group = values[group.chosen & np.isfinite(values)]
+        colour = _TYPE_COLOUR
+        if group.driver_type == style.ALL_TYPES:
+            colour = colours.JOB_COLOURS[sites.index(group.site) % len(colours.JOB_COLOURS)]
+        if len(of_group) >= _VIOLIN and np.ptp(of_group) > 0:
             violin = axes.violinplot(
-                mine, [place], orientation="horizontal", widths=0.85, showextrema=False
+                of_group, [place], orientation="horizontal", widths=0.85, showextrema=False
             )
             for body in violin["bodies"]:  # type: ignore[attr-defined]  # the stub says Collection
                 body.set(facecolor=colour, alpha=0.25, linewidth=0)
-        if not len(mine):
+        if not len(of_group):
             continue
-        spread = scatter.uniform(-0.16, 0.16, len(mine)) if len(mine) > 1 else np.zeros(1)
+        # Dots lie apart by chance across their row, so that equal values do not hide one another.
+        aside = np.zeros(1)
+        if len(of_group) > 1:
+            aside = scatter.uniform(-0.16, 0.16, len(of_group))
         axes.plot(
-            mine,
-            place + spread,
+            of_group,
+            place + aside,
             ".",
             color=colour,
             markersize=canvas.points(2.5),
             alpha=0.55,
             mew=0,
         )
-        low, middle, high = np.quantile(mine, [0.25, 0.5, 0.75])
+        low, middle, high = np.quantile(of_group, [0.25, 0.5, 0.75])
         axes.plot([low, high], [place, place], color=colour, linewidth=canvas.points(2.2))
         (mark,) = axes.plot(
             middle,
@@ -98,7 +98,7 @@ def _panel(axes: Axes, values: canvas.Array, shown: Sequence[style.Group], title
             markeredgecolor="white",
             markersize=canvas.points(6),
         )
-        canvas.hover(mark, f"{_called(group)}: median {middle:.3g}, {len(mine)} drivers")
+        canvas.hover(mark, f"{_called(group)}: median {middle:.3g}, {len(of_group)} drivers")
     axes.set_yticks(range(len(shown)), [_called(group) for group in shown])
     for tick, group in zip(axes.get_yticklabels(), shown, strict=True):
         tick.set_fontweight("bold" if group.driver_type == style.ALL_TYPES else "normal")

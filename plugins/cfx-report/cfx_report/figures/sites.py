@@ -23,12 +23,11 @@ def draw_sites(sites: pd.DataFrame) -> Figure | None:
     Args:
         sites: as `cfx.evaluation.sites.site_table`.
     """
-    panels = [
-        (scope, baseline)
-        for scope, baseline in _PANELS
-        if f"over_{baseline}" in sites
-        and sites.loc[sites["scope"] == scope, f"over_{baseline}"].notna().any()
-    ]
+    panels = []
+    for scope, baseline in _PANELS:
+        of_scope = sites[sites["scope"] == scope]
+        if f"over_{baseline}" in sites and of_scope[f"over_{baseline}"].notna().any():
+            panels.append((scope, baseline))
     if not panels:
         return None
     names = list(dict.fromkeys(zip(sites["site"], sites["driver_type"], strict=True)))
@@ -47,7 +46,7 @@ def draw_sites(sites: pd.DataFrame) -> Figure | None:
 
 def _called(site: str, kind: str) -> str:
     if kind != ALL_SITES:
-        return f"{kind}"
+        return kind
     return "mean over sites" if site == ALL_SITES else site
 
 

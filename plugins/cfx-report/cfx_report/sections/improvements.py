@@ -168,9 +168,12 @@ def cluster_series(jobs: Sequence[Result]) -> dict[str, dict[str, pd.DataFrame]]
             if not set(clusters) & set(series.get(together, {})):
                 name = together
         series.setdefault(name, {}).update(clusters)
-    ordered = {}
+    ordered: dict[str, dict[str, pd.DataFrame]] = {}
     for name, by_cluster in series.items():
-        ordered[name] = {c: by_cluster[c] for c in style.CLUSTERS if c in by_cluster}
+        ordered[name] = {}
+        for cluster in style.CLUSTERS:
+            if cluster in by_cluster:
+                ordered[name][cluster] = by_cluster[cluster]
     return ordered
 
 

@@ -110,20 +110,22 @@ def _pair(job: Result) -> str:
 
 def verdicts(about: Mapping[str, Any], jobs: Sequence[Result]) -> list[str]:
     """Return what the jobs say of the paper's claim, and the claim."""
-    said = []
+    sentences = []
     if about["judged"]:
-        gains = {job.name: float(value_of(job, about["judged"])) for job in jobs}
-        for name, gain in gains.items():
-            said.append(f"{name}: mean of the ratios {wording.percent_or_undefined(gain, 1)}.")
-        measured = [gain for gain in gains.values() if math.isfinite(gain)]
-        if len(measured) > 1:
-            above = sum(gain > 0 for gain in measured)
-            said.append(f"Above 0 % in {above} of {len(measured)} jobs here.")
+        measured = above = 0
+        for job in jobs:
+            gain = float(value_of(job, about["judged"]))
+            in_words = wording.percent_or_undefined(gain, 1)
+            sentences.append(f"{job.name}: mean of the ratios {in_words}.")
+            measured += math.isfinite(gain)
+            above += math.isfinite(gain) and gain > 0
+        if measured > 1:
+            sentences.append(f"Above 0 % in {above} of {measured} jobs here.")
     if "ranked" in about and math.isfinite(value_of(jobs[0], about["ranked"])):
-        said.append(f"The smallest of the last column here: {jobs[0].name}.")
+        sentences.append(f"The smallest of the last column here: {jobs[0].name}.")
     for better in about.get("better", ()):
-        said += _compared(better, about["judged"], jobs)
-    return [*said, about["claim"]]
+        sentences += _compared(better, about["judged"], jobs)
+    return [*sentences, about["claim"]]
 
 
 def _ranked(jobs: Sequence[Result], path: str) -> list[Result]:
@@ -138,23 +140,23 @@ def _ranked(jobs: Sequence[Result], path: str) -> list[Result]:
 
 def _compared(better: Mapping[str, str], judged: str, jobs: Sequence[Result]) -> list[str]:
     """Say whether the policy fares better with one value than with another, others being equal."""
-    gains: dict[str, dict[str, float]] = {}
+    gains: dict[str, dict[str, float]] = {}  # by what jobs share, then by what is compared
     for job in jobs:
         gain = value_of(job, judged)
         if math.isfinite(gain):
-            alike = gains.setdefault(str(value_of(job, better["same"])), {})
-            alike[str(value_of(job, better["value"]))] = gain
-    said = []
-    for same, improvements in gains.items():
-        if {better["with"], better["than"]} <= set(improvements):
-            more = "no better"
-            if improvements[better["with"]] > improvements[better["than"]]:
-                more = "better"
-            said.append(
-                f"{same}: the policy fares {more} with {better['with']} than with {better['than']}"
-                " here; better in the paper."
+            gains_of_equals = gains.setdefault(str(value_of(job, better["same"])), {})
+            gains_of_equals[str(value_of(job, better["value"]))] = gain
+    sentences = []
+    for shared, gain_of in gains.items():
+        if {better["with"], better["than"]} <= set(gain_of):
+            verdict = "no better"
+            if gain_of[better["with"]] > gain_of[better["than"]]:
+                verdict = "better"
+            sentences.append(
+                f"{shared}: the policy fares {verdict} with {better['with']} than with"
+                f" {better['than']} here; better in the paper."
             )
-    return said
+    return sentences
 
 
 def differences(paper: Mapping[str, Any], about: Mapping[str, Any], jobs: Sequence[Result]) -> str:
@@ -164,15 +166,17 @@ def differences(paper: Mapping[str, Any], about: Mapping[str, Any], jobs: Sequen
     if pairs > 1:
         number_of = {"what": "the number of pairs", "value": "pairs", "there": f"{pairs} in all"}
         listed.insert(1, {**number_of, "same": str(pairs)})
-    parts = []
+    differing = []
     for condition in listed:
-        here = sorted({str(value_of(job, condition["value"])) for job in jobs} - {""})
-        if here and here != [condition["same"]]:
-            parts.append(
-                f"{condition['what']} (here {' or '.join(here)}; there {condition['there']})"
-            )
-    told = "; ".join([*parts, paper["unknown"]])
-    return f"The numbers need not agree, because these things differ, or may: {told}."
+        values = {str(value_of(job, condition["value"])) for job in jobs}
+        values.discard("")  # of jobs of which it is not known
+        if values and values != {condition["same"]}:
+            here = " or ".join(sorted(values))
+            differing.append(f"{condition['what']} (here {here}; there {condition['there']})")
+    differing.append(paper["unknown"])
+    return (
+        f"The numbers need not agree, because these things differ, or may: {'; '.join(differing)}."
+    )
 
 
 def _cell(place: int, form: str, row: Sequence[Any]) -> Cell:

@@ -41,9 +41,9 @@ class RunSection(Section):
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return what all jobs share, and a table of what they do not."""
-        unfinished = [
-            (job_folder.without_folders(job.place), job.reason) for job in runs.unfinished
-        ]
+        unfinished = []
+        for job in runs.unfinished:
+            unfinished.append((job_folder.without_folders(job.place), job.reason))
         common, differing = facts(runs.jobs)
         return {"unfinished": unfinished, "common": common, "differing": differing}
 
@@ -110,13 +110,13 @@ def duration(seconds: float | None) -> str:
     """Returns a duration as one says it: "42 s", "3 min 5 s", "2 h 10 min"."""
     if seconds is None:
         return "not recorded"
-    minutes, rest = divmod(round(seconds), 60)
-    hours, minutes_left = divmod(minutes, 60)
+    minutes, whole_seconds = divmod(round(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
     if hours:
-        return f"{hours} h {minutes_left} min"
+        return f"{hours} h {minutes} min"
     if minutes:
-        return f"{minutes} min {rest} s"
-    return f"{rest} s"
+        return f"{minutes} min {whole_seconds} s"
+    return f"{whole_seconds} s"
 
 
 def _facts(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
@@ -147,11 +147,12 @@ def _facts(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
 
 
 def _calibration(job: Result) -> str:
-    said = job.component("optimizer") or wording.NOTHING
+    """Says which optimizer calibrated, and what it minimised."""
+    words = job.component("optimizer") or wording.NOTHING
     objective = job.data.get("objective")
     if isinstance(objective, Mapping):
-        said += f", which minimises {objective.get('name')} ({objective.get('unit')})"
-    return said
+        words += f", which minimises {objective.get('name')} ({objective.get('unit')})"
+    return words
 
 
 def _left_out(job: Result) -> str:
@@ -220,6 +221,7 @@ def _learned(job: Result) -> str:
 
 
 def _protocol(job: Result) -> str:
+    """Says who was calibrated, learned from and tested, on which part of trajectories."""
     name = job.component("protocol")
     train, test = f"{100 * job.split:.3g} %", f"{100 * (1 - job.split):.3g} %"
     parts = (
@@ -227,22 +229,20 @@ def _protocol(job: Result) -> str:
         f" part is the last {test}"
     )
     if name == "within_driver" and job.split == 1:
-        said = "calibrated on whole trajectories, of which the errors are"
-    elif name == "within_driver":
+        return f"{name}: calibrated on whole trajectories, of which the errors are"
+    if name == "within_driver":
         used = "calibrated" if job.purpose is Purpose.CALIBRATION else "calibrated and learned"
-        said = f"{used} on the first {train} of each pair, tested on the last {test}"
-    elif job.setting("protocol.folds") and not job.setting("protocol.run"):
+        return f"{name}: {used} on the first {train} of each pair, tested on the last {test}"
+    if job.setting("protocol.run"):
+        return (
+            f"{name}: nothing is trained: another job's policy is tested, and pooled calibration is"
+            f" that of the drivers it learned from; {parts}"
+        )
+    if job.setting("protocol.folds"):
         folds = f"{job.setting('protocol.folds')} folds"
-        apart = _TOGETHER.get(str(job.setting("protocol.together")), "")
-        said = (
-            "trained on some drivers and tested on unseen drivers: nobody is, as follower, in both;"
-            f" {folds}{apart}; {parts}"
+        together = _TOGETHER.get(str(job.setting("protocol.together")), "")
+        return (
+            f"{name}: trained on some drivers and tested on unseen drivers: nobody is, as follower,"
+            f" in both; {folds}{together}; {parts}"
         )
-    elif job.setting("protocol.run"):
-        said = (
-            "nothing is trained: another job's policy is tested, and pooled calibration is that of"
-            f" the drivers it learned from; {parts}"
-        )
-    else:
-        return name
-    return f"{name}: {said}"
+    return name

@@ -23,19 +23,20 @@ def members_of(names: Collection[str], files: Iterable[Path]) -> dict[str, tuple
         files: XML, perhaps compressed (`.gz`), in the order in which SUMO reads them; no more of
             them is read than it takes to find the names.
     """
-    wanted = set(names)
-    found: dict[str, tuple[str, ...]] = {}
+    missing = set(names)
+    members: dict[str, tuple[str, ...]] = {}
     for file in files:
         for element in _types_in(file):
             name = element.get("id", "")
-            if name in wanted:
-                wanted.discard(name)
+            if name in missing:
+                missing.discard(name)
                 if element.tag == "vTypeDistribution":
-                    own = [one.get("id", "") for one in element.iter("vType")]
-                    found[name] = (*element.get("vTypes", "").split(), *own)
-            if not wanted:
-                return found
-    return found
+                    # Members are named in an attribute, or stand inside the distribution.
+                    inside = [vtype.get("id", "") for vtype in element.iter("vType")]
+                    members[name] = (*element.get("vTypes", "").split(), *inside)
+            if not missing:
+                return members
+    return members
 
 
 def _types_in(file: Path) -> Iterator[ElementTree.Element]:

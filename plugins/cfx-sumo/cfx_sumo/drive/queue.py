@@ -73,7 +73,8 @@ class QueueAtLight:
                 self._crossed = None
             self._phase = phase
         if self._crossed is not None:
-            self._crossed += [now for name in sorted(self._on - on) if name in self._queue]
+            crossed = (self._on - on).intersection(self._queue)
+            self._crossed += [now] * len(crossed)
         self._on = on
 
     def _standing(self, vehicle: Any, on: set[str]) -> list[str]:
@@ -97,7 +98,8 @@ class QueueAtLight:
     @property
     def _saturated(self) -> float:
         """The mean headway of the fifth vehicles and later, s."""
-        return float(np.mean([one for green in self.headways for one in green[_STARTING:]]))
+        later = [green[_STARTING:] for green in self.headways]
+        return float(np.mean(np.concatenate(later)))
 
     @property
     def saturation_flow(self) -> float:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -28,55 +30,61 @@ def draw_report(report: ScenarioReport) -> Figure:
     (flows, headways), paths = figure.subplots(2, 2)
     runs = {"cfx": report.driven, "SUMO's own models": report.plain}
     shades = {"cfx": colours.colour_of("policy"), "SUMO's own models": colours.colour_of("default")}
-    for name, seen in runs.items():
-        of_lanes = lane_flows(seen).values()
-        speed = [one.speed for one in of_lanes]
-        flow = [one.flow for one in of_lanes]
-        flows.plot(speed, flow, "o", markersize=4, alpha=0.7, color=shades[name], label=name)
-        gaps = np.concatenate([np.zeros(0), *(one.headways for one in of_lanes)])
-        gaps = gaps[gaps < _LONGEST_S]
+    fastest = 0.0
+    for name, observations in runs.items():
+        speed_of_lanes, flow_of_lanes, headways_of_lanes = [], [], [np.zeros(0)]
+        for lane_flow in lane_flows(observations).values():
+            speed_of_lanes.append(lane_flow.speed)
+            flow_of_lanes.append(lane_flow.flow)
+            headways_of_lanes.append(lane_flow.headways)
+        style: dict[str, Any] = {"markersize": 4, "alpha": 0.7, "color": shades[name]}
+        flows.plot(speed_of_lanes, flow_of_lanes, "o", label=name, **style)
+        times = np.concatenate(headways_of_lanes)
+        times = times[times < _LONGEST_S]
         bins = np.arange(0.0, _LONGEST_S + 0.01, 0.25)
-        if len(gaps):
+        if len(times):
             headways.hist(
-                gaps, bins, density=True, histtype="step", linewidth=1.8, color=shades[name]
+                times, bins, density=True, histtype="step", linewidth=1.8, color=shades[name]
             )
+        fastest = max(fastest, observations.speed.max(initial=0.0))
     flows.margins(0.1)
     flows.set(xlabel="mean speed of a lane [m/s]", ylabel="flow [vehicles/h]", title="lanes")
     flows.set(xlim=(0, None), ylim=(0, None))
     flows.legend(loc="upper left")
     headways.set(xlabel="time headway [s]", ylabel="density [1/s]", title="headways")
     lane = busiest_lane(report.driven)
-    fastest = max((float(seen.speed.max()) for seen in runs.values() if len(seen.speed)), default=1)
-    drawn = None
-    for axes, (name, seen) in zip(paths, runs.items(), strict=True):
-        drawn = _draw_paths(axes, seen, lane, fastest) or drawn
+    coloured = None
+    for axes, (name, observations) in zip(paths, runs.items(), strict=True):
+        coloured = _draw_paths(axes, observations, lane, fastest) or coloured
         axes.set_title(f"{name}: lane {lane}")
     # Both over the same time, to be compared.
-    ends = [axes.get_xlim() for axes in paths]
+    first, last = np.array([axes.get_xlim() for axes in paths]).T
     for axes in paths:
-        axes.set_xlim(min(low for low, _ in ends), max(high for _, high in ends))
-    if drawn is not None:
-        figure.colorbar(drawn, ax=list(paths), label="speed [m/s]", pad=0.02)
+        axes.set_xlim(first.min(), last.max())
+    if coloured is not None:
+        figure.colorbar(coloured, ax=list(paths), label="speed [m/s]", pad=0.02)
     return figure
 
 
 def _draw_paths(
-    axes: Axes, seen: Observations, lane: str | None, fastest: float
+    axes: Axes, observations: Observations, lane: str | None, fastest: float
 ) -> LineCollection | None:
     """Draws the vehicles of a lane over time, by their speed; None where there are none."""
     axes.set(xlabel="time [s]", ylabel="position [m]")
-    if lane not in seen.lanes:
+    if lane not in observations.lanes:
         return None
-    number = seen.lanes.index(lane)
-    together = (seen.vehicle[1:] == seen.vehicle[:-1]) & (seen.lane[1:] == number)
-    together &= (seen.lane[:-1] == number) & (np.diff(seen.time) < 1.5 * EVERY_S)
+    number = observations.lanes.index(lane)
+    vehicle, is_on_lane = observations.vehicle, observations.lane == number
+    # Whether a line leads from each observation to the next one, `(N - 1,)`.
+    is_joined = (vehicle[1:] == vehicle[:-1]) & is_on_lane[1:] & is_on_lane[:-1]
+    is_joined &= np.diff(observations.time) < 1.5 * EVERY_S
     # On a ring a vehicle comes back to the beginning of its lane.
-    together &= np.diff(seen.position) > -1.0
-    points = np.stack([seen.time, seen.position], 1)
-    lines = np.stack([points[:-1][together], points[1:][together]], 1)
-    drawn = LineCollection(list(lines), cmap="viridis", linewidths=0.8)
-    drawn.set_array(seen.speed[1:][together])
-    drawn.set_clim(0.0, fastest)
-    axes.add_collection(drawn)
+    is_joined &= np.diff(observations.position) > -1.0
+    points = np.stack([observations.time, observations.position], 1)  # (N, 2)
+    lines = np.stack([points[:-1][is_joined], points[1:][is_joined]], 1)  # (lines, 2 ends, 2)
+    coloured = LineCollection(list(lines), cmap="viridis", linewidths=0.8)
+    coloured.set_array(observations.speed[1:][is_joined])
+    coloured.set_clim(0.0, fastest or 1.0)
+    axes.add_collection(coloured)
     axes.autoscale()
-    return drawn
+    return coloured

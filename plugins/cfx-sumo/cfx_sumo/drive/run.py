@@ -310,13 +310,13 @@ def _check_on_the_road(run: ScenarioRun, scenario: Path) -> None:
     for name, tally in run.tallies.items():
         if tally.vehicles:
             continue
-        why = ""
+        reason = ""
         if run.left_out:
             number, first = len(run.left_out), run.left_out[0]
-            why = f". SUMO left out {number} of the scenario's vehicles and flows: {first}"
+            reason = f". SUMO left out {number} of the scenario's vehicles and flows: {first}"
         raise SumoError(
             f"no vehicle of vType '{name}' was ever on the road in {scenario}"
-            f" ({run.steps * run.dt:g} s); give it a flow, or a later --end{why}"
+            f" ({run.steps * run.dt:g} s); give it a flow, or a later --end{reason}"
         )
 
 
@@ -341,19 +341,20 @@ def _crossings_of_sumo(
             sumo.simulationStep()
             observer.look(sumo)
             touching = set()
-            for found in sumo.simulation.getCollisions():
-                driven = fleet.has_type(found.colliderType) or fleet.has_type(found.victimType)
-                if driven and _is_crossing(found):
-                    touching.add((found.collider, found.victim))
-            total += len(touching - before)
+            for reported in sumo.simulation.getCollisions():
+                is_driven = fleet.has_type(reported.colliderType)
+                is_driven |= fleet.has_type(reported.victimType)
+                if is_driven and _is_crossing(reported):
+                    touching.add((reported.collider, reported.victim))
+            total += len(touching - before)  # a collision that lasts for steps counts once
             before = touching
             task.advance()
     return total
 
 
-def _is_crossing(found: Any) -> bool:
+def _is_crossing(reported: Any) -> bool:
     """Says whether a collision that SUMO reports is one of crossing paths."""
-    return "junction" in found.type
+    return "junction" in reported.type
 
 
 def _name(scenario: Path | str) -> str:
@@ -507,9 +508,9 @@ def command_line(
         command += ["--start", "--quit-on-end", "--delay", "100"]
     # SUMO does not look for collisions at junctions unless it is told to.
     switches = ("--no-step-log", "--duration-log.disable", "--no-warnings", _CHECK_JUNCTIONS)
-    given = {option.partition("=")[0] for option in options}
+    set_by_user = {option.partition("=")[0] for option in options}
     for name in switches:
-        if name not in given:
+        if name not in set_by_user:
             command += [name, "true"]
     if step is not None:
         command += ["--step-length", f"{step:g}"]
@@ -520,10 +521,10 @@ def command_line(
 
 def _reason(error: Exception) -> str:
     """Returns SUMO's words on one line; some of them it prints on stderr alone."""
-    said = " ".join(str(error).split()).rstrip(".")
-    if said in {"", "Process Error", "Connection closed by SUMO"}:
+    message = " ".join(str(error).split()).rstrip(".")
+    if message in {"", "Process Error", "Connection closed by SUMO"}:
         return "its own message stands above"
-    return said
+    return message
 
 
 class _Motions(NamedTuple):
@@ -590,17 +591,17 @@ class _Run:
 
     def _check_types(self) -> None:
         """Checks that all vTypes are in the scenario."""
-        known = self._sumo.vehicletype.getIDList()
+        vtypes = self._sumo.vehicletype.getIDList()
         for name in self._fleet.drivers:
-            if name not in known:
-                own = []
-                for one in known:
-                    if not one.startswith("DEFAULT_"):
-                        own.append(one)
+            if name not in vtypes:
+                of_scenario = []
+                for vtype in vtypes:
+                    if not vtype.startswith("DEFAULT_"):  # SUMO's own
+                        of_scenario.append(vtype)
                 raise SumoError(
-                    f"{self._scenario} has no vType '{name}'.{nearest(name, own)} It has:"
-                    f" {', '.join(own) or 'none of its own'}. (A vType must stand ahead of the"
-                    " first vehicle.)"
+                    f"{self._scenario} has no vType '{name}'.{nearest(name, of_scenario)} It has:"
+                    f" {', '.join(of_scenario) or 'none of its own'}. (A vType must stand ahead of"
+                    " the first vehicle.)"
                 )
 
     def _name_members(self) -> None:
@@ -677,9 +678,9 @@ class _Run:
         last = math.inf
         if end is not None:
             last = end
-        given = self._sumo.simulation.getEndTime()
-        if given >= 0:
-            last = min(last, given)
+        end_of_scenario = self._sumo.simulation.getEndTime()
+        if end_of_scenario >= 0:  # -1: the scenario names none
+            last = min(last, end_of_scenario)
         return last
 
     def _after_step(self, dt: float) -> None:
@@ -750,7 +751,7 @@ class _Run:
         for name in names:
             motions.append((vehicle.getSpeed(name), vehicle.getAcceleration(name)))
         speed, acceleration = np.array(motions, dtype=np.float64).T
-        behind = sum(1 for name in names if driver.follows(name))
+        behind = sum(map(driver.follows, names))
         return _Motions(names, speed, acceleration, behind, driver.time_gaps(names).numpy())
 
     def _count_lanes(self, vehicles: Mapping[str, str]) -> None:
@@ -760,13 +761,13 @@ class _Run:
             return
         self._lanes_next = now + _LANES_EVERY_S
         names = list(vehicles)
-        lanes, before = dict(zip(names, lanes_of(self._sumo, names), strict=True)), self._lanes
+        lanes = dict(zip(names, lanes_of(self._sumo, names), strict=True))
         for name, lane in lanes.items():
-            last = before.get(name, lane)
-            if lane == last:
+            last_lane = self._lanes.get(name, lane)
+            if lane == last_lane:
                 continue
-            edge, _, index = lane.rpartition("_")
-            last_edge, _, last_index = last.rpartition("_")
+            edge, _, index = lane.rpartition("_")  # SUMO calls lanes EDGE_INDEX
+            last_edge, _, last_index = last_lane.rpartition("_")
             if edge and edge == last_edge:
                 self._tallies[vehicles[name]].lane_changes += abs(int(index) - int(last_index))
         self._lanes = lanes
@@ -782,21 +783,21 @@ class _Run:
         """Notes the collisions that SUMO reports after a step; one that goes on is one."""
         now = self._sumo.simulation.getTime()
         touching = {}
-        for found in self._sumo.simulation.getCollisions():
-            kind = self._type_of.get(found.collider) or self._type_of.get(found.victim)
+        for reported in self._sumo.simulation.getCollisions():
+            kind = self._type_of.get(reported.collider) or self._type_of.get(reported.victim)
             if kind is None:
                 continue
-            key = found.collider, found.victim
-            known, before = self._touching.get(key), self._gap_before(*key)
-            if known is None:
-                gap = self._gap(found, before, dt)
-                crossing = _is_crossing(found)
-                known = Collision(now, kind, *key, found.lane, found.pos, gap, crossing)
-                self._collisions.append(known)
-            elif known.gap is not None and before is not None:
+            key = reported.collider, reported.victim
+            collision, gap_before = self._touching.get(key), self._gap_before(*key)
+            if collision is None:
+                gap = self._gap(reported, gap_before, dt)
+                crossing = _is_crossing(reported)
+                collision = Collision(now, kind, *key, reported.lane, reported.pos, gap, crossing)
+                self._collisions.append(collision)
+            elif collision.gap is not None and gap_before is not None:
                 # SUMO goes on to report the speeds of the first step.
-                known.gap = min(known.gap, before)
-            touching[key] = known
+                collision.gap = min(collision.gap, gap_before)
+            touching[key] = collision
         self._touching = touching
 
     def _gap_before(self, collider: str, victim: str) -> float | None:
@@ -805,22 +806,22 @@ class _Run:
             return None
         return self._fleet.driver(collider).gap_to(collider, victim)
 
-    def _gap(self, found: Any, before: float | None, dt: float) -> float | None:
+    def _gap(self, reported: Any, gap_before: float | None, dt: float) -> float | None:
         """Returns the gap as a collision begins, bumper to bumper, m.
 
         SUMO may have taken the vehicles off the road by now. So it is the gap of the step before,
         and what their speeds have made of it; for a vehicle that has just changed lanes, or that no
         policy drives, the places of both on the lane.
         """
-        if found.type != "collision":
+        if reported.type != "collision":
             return None  # their paths cross, or they meet head-on
-        if before is not None:
-            return float(before + (found.victimSpeed - found.colliderSpeed) * dt)
-        vehicle = self._sumo.vehicle
-        if found.victim not in vehicle.getIDList() or vehicle.getLaneID(found.victim) != found.lane:
+        if gap_before is not None:
+            return float(gap_before + (reported.victimSpeed - reported.colliderSpeed) * dt)
+        vehicle, victim = self._sumo.vehicle, reported.victim
+        if victim not in vehicle.getIDList() or vehicle.getLaneID(victim) != reported.lane:
             return None
-        back = vehicle.getLanePosition(found.victim) - vehicle.getLength(found.victim)
-        return float(back - found.pos)
+        rear = vehicle.getLanePosition(victim) - vehicle.getLength(victim)
+        return float(rear - reported.pos)
 
     def _count_teleports(self) -> None:
         for name in self._sumo.simulation.getStartingTeleportIDList():
@@ -886,18 +887,18 @@ class _Rows:
         return row
 
 
-def parse_drivers(given: Sequence[str]) -> dict[str, str]:
+def parse_drivers(arguments: Sequence[str]) -> dict[str, str]:
     """Reads `TYPE=RUN` arguments.
 
     Raises:
         ConfigError: one is not of this form, or names a vType twice.
     """
     runs: dict[str, str] = {}
-    for one in given:
-        name, equals, run = one.partition("=")
+    for argument in arguments:
+        name, equals, run = argument.partition("=")
         if not (name and equals and run):
             raise ConfigError(
-                f"--drivers {one}: write TYPE=RUN, a vType of the scenario and a job's output"
+                f"--drivers {argument}: write TYPE=RUN, a vType of the scenario and a job's output"
                 " folder"
             )
         if name in runs:

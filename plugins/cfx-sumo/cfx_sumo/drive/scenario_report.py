@@ -112,27 +112,29 @@ class LaneFlow(NamedTuple):
     headways: Floats
 
 
-def lane_flows(seen: Observations) -> dict[str, LaneFlow]:
+def lane_flows(observations: Observations) -> dict[str, LaneFlow]:
     """Returns the traffic of each lane.
 
     When a vehicle passes a place follows from where it was a second before and after, at a constant
     speed in between.
     """
     flows = {}
-    same = (seen.vehicle[1:] == seen.vehicle[:-1]) & (seen.lane[1:] == seen.lane[:-1])
-    same &= np.diff(seen.time) < 1.5 * EVERY_S
-    for number, name in enumerate(seen.lanes):
-        on_lane = seen.lane == number
-        position = seen.position[on_lane]
-        place = 0.5 * (float(position.min()) + float(position.max()))
-        before, after = seen.position[:-1], seen.position[1:]
-        passes = same & (seen.lane[1:] == number) & (before < place) & (place <= after)
-        share = (place - before[passes]) / (after[passes] - before[passes])
-        times = np.sort(seen.time[:-1][passes] + share * np.diff(seen.time)[passes])
+    vehicle, lane, time = observations.vehicle, observations.lane, observations.time
+    # Whether the next observation is of the same vehicle in the same lane, `(N - 1,)`.
+    goes_on = (vehicle[1:] == vehicle[:-1]) & (lane[1:] == lane[:-1])
+    goes_on &= np.diff(time) < 1.5 * EVERY_S
+    before, after = observations.position[:-1], observations.position[1:]
+    for number, name in enumerate(observations.lanes):
+        on_lane = lane == number
+        position = observations.position[on_lane]
+        middle = 0.5 * (float(position.min()) + float(position.max()))
+        passes = goes_on & on_lane[1:] & (before < middle) & (middle <= after)
+        share = (middle - before[passes]) / (after[passes] - before[passes])
+        times = np.sort(time[:-1][passes] + share * np.diff(time)[passes])
         flows[name] = LaneFlow(
             name,
-            3600.0 * len(times) / max(seen.seconds, EVERY_S),
-            float(seen.speed[on_lane].mean()),
+            3600.0 * len(times) / max(observations.seconds, EVERY_S),
+            float(observations.speed[on_lane].mean()),
             np.diff(times),
         )
     return flows
@@ -145,11 +147,11 @@ class ScenarioReport(NamedTuple):
     plain: Observations
 
 
-def busiest_lane(seen: Observations) -> str | None:
+def busiest_lane(observations: Observations) -> str | None:
     """Returns the lane on which vehicles spent most time; None if there were no vehicles."""
-    if not len(seen.lane):
+    if not len(observations.lane):
         return None
-    return seen.lanes[int(np.bincount(seen.lane).argmax())]
+    return observations.lanes[int(np.bincount(observations.lane).argmax())]
 
 
 def write_report(report: ScenarioReport, folder: Path) -> list[Path]:
@@ -160,20 +162,24 @@ def write_report(report: ScenarioReport, folder: Path) -> list[Path]:
     """
     by_run = {"cfx": lane_flows(report.driven), "sumo": lane_flows(report.plain)}
     lanes = sorted(set(by_run["cfx"]) | set(by_run["sumo"]))
-    rows, gaps = [], []
+    rows = []
+    headways: list[list[object]] = []
     for lane in lanes:
         row: list[object] = [lane]
         for run, flows in by_run.items():
-            found = flows.get(lane)
-            row += ["", ""] if found is None else [round(found.flow, 1), round(found.speed, 3)]
-            if found is not None:
-                gaps += [[run, lane, round(float(value), 3)] for value in found.headways]
+            lane_flow = flows.get(lane)
+            if lane_flow is None:
+                row += ["", ""]
+                continue
+            row += [round(lane_flow.flow, 1), round(lane_flow.speed, 3)]
+            for headway in lane_flow.headways.tolist():
+                headways.append([run, lane, round(headway, 3)])
         rows.append(row)
     columns = ["lane", "cfx_flow", "cfx_speed_mps", "sumo_flow", "sumo_speed_mps"]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _write(folder / "lanes.csv", columns, rows)
-        _write(folder / "headways.csv", ["run", "lane", "headway_s"], gaps)
+        _write(folder / "headways.csv", ["run", "lane", "headway_s"], headways)
     except OSError as error:
         raise OutputError(
             f"{folder} cannot be written ({error.strerror}); name another --report"
