@@ -44,7 +44,7 @@ def printed(live: Forks, folder: Path, program: str) -> object:
 NEXT_AHEAD = """
 placed = {
     "first": (0, 1480.0, 0.0), "second": (1, 1477.0, 0.0), "third": (1, 1465.0, 0.0),
-    "fourth": (0, 1450.0, 0.0), "far": (1, 1380.0, 0.0),
+    "fourth": (0, 1450.0, 0.0), "fast": (1, 1446.0, 15.0), "far": (1, 1380.0, 0.0),
 }
 start(ASSETS / "town.net.xml", "wide narrow", placed)
 libsumo.simulationStep()

@@ -144,6 +144,9 @@ class Driver:
     stops and do not yield. That is meant for replays of recordings and roads
     without junctions. Lane changes are SUMO's.
 
+    Where two lanes become one by turns, a vehicle lets whoever is ahead on the other lane go first
+    (`cfx_sumo.live.zippers`), unless the speed mode leaves out who goes first (bit 8).
+
     The model's limits of acceleration hold always (`model.limits`). Where SUMO bounds braking too
     (bit 4 of the speed mode), a vehicle brakes comfortably at most, unless keeping its
     vType's `minGap` needs more: see `needed_deceleration`. Then it brakes as hard as that, by its

@@ -116,16 +116,24 @@ class Zippers:
         return Turns(rows, leading)
 
     def _behind(self, connection: Connection) -> dict[str, tuple[str, float]]:
-        """Returns, of each vehicle behind one of the other lane, that one and how far ahead."""
-        behind = {}
+        """Returns, of each vehicle behind one of the other lane, that one and how far ahead.
+
+        A vehicle that could not fall behind within a second by braking goes first for SUMO, if it
+        arrives first. So it follows nobody.
+        """
+        behind, vehicle = {}, connection.vehicle
         for coming in self._coming(connection).values():
             # The last one on another lane among those nearer to the line.
             other: Coming | None = None
             for ahead, one in pairwise(sorted(coming)):
                 if ahead.before != one.before:
                     other = ahead
-                if other is not None:
-                    behind[one.name] = (other.name, one.distance - other.distance)
+                if other is None:
+                    continue
+                apart = one.distance - other.distance
+                faster = vehicle.getSpeed(one.name) - vehicle.getSpeed(other.name)
+                if apart > faster - vehicle.getDecel(one.name):
+                    behind[one.name] = (other.name, apart)
         return behind
 
     def _coming(self, connection: Connection) -> dict[str, list[Coming]]:
