@@ -14,10 +14,14 @@ import sys
 
 SCRIPT = """
 import sys
+from xml.etree import ElementTree
 sys.modules["pyarrow"] = None
 from cfx_sumo.drive import traffic
 from cfx_sumo.live.fleet import Fleet
-step, kind, run = float(sys.argv[1]), sys.argv[2], sys.argv[3]
+step, given, run = float(sys.argv[1]), sys.argv[2], sys.argv[3]
+vtype = ElementTree.fromstring(traffic.CAR)
+vtype.attrib.update(ElementTree.fromstring(f"<vType {given}/>").attrib)
+kind = ElementTree.tostring(vtype, encoding="unicode")
 scenario = traffic._DROP._replace(routes=traffic._DROP.routes.replace(traffic.CAR, kind))
 fleet = Fleet.load({"car": run}, seed=0) if run else None
 passed = traffic._Arrivals(traffic._DROP_FROM_S)
@@ -28,10 +32,6 @@ print(f"{passed.count * 3600.0 / (traffic._DROP_S - traffic._DROP_FROM_S):.0f}")
 
 def main() -> None:
     """Prints a row for each vType."""
-    from cfx_sumo.drive.scenarios import CAR
-
-    from .saturation_flow import with_attributes
-
     parser = argparse.ArgumentParser()
     parser.add_argument("step")
     parser.add_argument("--driver", default="")
@@ -39,8 +39,7 @@ def main() -> None:
     options = parser.parse_args()
     print("vType | discharge (vehicles/h)")
     for given in options.vtypes:
-        kind = with_attributes(CAR, given) if given else CAR
-        command = [sys.executable, "-c", SCRIPT, options.step, kind, options.driver]
+        command = [sys.executable, "-c", SCRIPT, options.step, given, options.driver]
         done = subprocess.run(command, capture_output=True, text=True, check=True)
         print(f"{given} | {done.stdout.strip()}", flush=True)
 
