@@ -86,6 +86,9 @@ class Road:
     def getLanePosition(self, name: str) -> float:  # noqa: N802
         return 0.0
 
+    def getLinks(self, lane: str) -> tuple[()]:  # noqa: N802
+        return ()
+
     def getNextLinks(self, name: str) -> list[tuple[Any, ...]]:  # noqa: N802
         return self.links
 

@@ -46,9 +46,13 @@ from cfx_sumo.live.saved import DriverRecord, read_state, write_state
 from cfx_sumo.live.surroundings import Connection, Seen, View, look
 from cfx_sumo.live.vehicles import KnownVehicles
 from cfx_sumo.live.windows import PolicyWindows
+from cfx_sumo.live.zippers import EASY_MPS2, Turns, Zippers
 
 _BOUNDS_BRAKING = 4
 """Bit of SUMO's speed mode with which a vehicle brakes no harder than its `decel`."""
+
+_YIELDS = 8
+"""Bit of the speed mode with which a vehicle regards who goes first at junctions."""
 
 _Floats = NDArray[np.float64]
 _Places = NDArray[np.int64]
@@ -140,6 +144,9 @@ class Driver:
     stops and do not yield. That is meant for replays of recordings and roads
     without junctions. Lane changes are SUMO's.
 
+    Where two lanes become one by turns, a vehicle lets whoever is ahead on the other lane go first
+    (`cfx_sumo.live.zippers`), unless the speed mode leaves out who goes first (bit 8).
+
     The model's limits of acceleration hold always (`model.limits`). Where SUMO bounds braking too
     (bit 4 of the speed mode), a vehicle brakes comfortably at most, unless keeping its
     vType's `minGap` needs more: see `needed_deceleration`. Then it brakes as hard as that, by its
@@ -210,6 +217,7 @@ class Driver:
         self._swept = math.nan
         self._now = -math.inf
         self._clock: Clock | None = None
+        self._zippers: Zippers | None = None
         self._view: View | None = None
         self._last = LastDrive()
 
@@ -478,14 +486,20 @@ class Driver:
         following, at = rows[:count], rows.numpy()
         first = speed = seen.speed.numpy()
         hardest = np.zeros_like(first)
+        turns = self._turns(connection, names, seen)
         for number in range(clock.substeps):
             if number > 0:
                 self._histories.append(following, seen)
             self._windows.choose(following, view.following, now + number * clock.step, clock)
             table.steps.numpy()[at[:count]] += 1
             self.counts.add(table.score.numpy()[at[:count]], table.beyond, following)
+            letting = self._letting_go_first(turns, rows, clock.step)
             taken = self._model_steps.take(connection, names, rows, seen, clock.step)
             speed = taken.speed
+            if turns is not None:
+                speed = np.minimum(speed, letting)
+                own = torch.from_numpy(speed)[turns.places]
+                turns = turns.one_step_later(own, clock.step)
             self.counts.limited += int(np.count_nonzero(taken.is_limited[:count]))
             if taken.bound is not None:
                 hardest = np.maximum(hardest, taken.bound)
@@ -502,6 +516,38 @@ class Driver:
         self.counts.free += clock.substeps * len(view.alone)
         self._tell(connection, names, at, first, speed, hardest, clock)
         self._last = LastDrive(view, rows, now)
+
+    def _turns(self, connection: Connection, names: list[str], seen: Seen) -> Turns | None:
+        """Finds the vehicles that let others go first at zippers; None: none does.
+
+        Args:
+            connection: to the simulation.
+            names: the D vehicles.
+            seen: what they do.
+        """
+        if not self.speed_mode & _YIELDS:
+            return None
+        if self._zippers is None:
+            self._zippers = Zippers(connection)
+        if not self._zippers.lanes:
+            return None
+        return self._zippers.turns(connection, names, seen)
+
+    def _letting_go_first(self, turns: Turns | None, rows: Tensor, dt: float) -> _Floats | float:
+        """Returns the highest speeds with which vehicles let others go first, `(D,)`, m/s.
+
+        Args:
+            turns: whom they let go first.
+            rows: of the D vehicles, `(D,)` int64.
+            dt: a step of the model, s.
+        """
+        if turns is None:
+            return math.inf
+        speed = np.full(len(rows), np.inf)
+        behind = self._model_steps.behind(rows[turns.places], turns.seen, dt)
+        easily = turns.seen.speed - EASY_MPS2 * dt
+        speed[turns.places.numpy()] = torch.maximum(behind, easily).numpy()
+        return speed
 
     def _take_up(
         self, connection: Connection, view: View, rows: Tensor, now: float, clock: Clock
@@ -756,7 +802,7 @@ class Driver:
         for vehicle in self.vehicles:
             self.forget(vehicle)
         self._swept = math.nan
-        self._clock = None
+        self._clock = self._zippers = None
         self._last = LastDrive()
         self._roster.clear()
 

@@ -109,6 +109,23 @@ class ModelSteps:
             is_limited = is_at_limit(self._limits, (speed - seen.speed.numpy()) / dt)
         return ModelStep(speed, bound, is_limited)
 
+    def behind(self, rows: Tensor, seen: Seen, dt: float) -> Tensor:
+        """Returns the next speeds of vehicles behind other leaders than their own, `(D,)`, m/s.
+
+        Nothing is kept of it: their steps are those of `take`.
+
+        Args:
+            rows: of the vehicles, `(D,)` int64.
+            seen: what they and those leaders do.
+            dt: the step, s.
+        """
+        table = self._vehicles.table
+        computed = torch.empty((len(_COMPUTED), len(rows)), dtype=torch.float64)
+        unkept = torch.empty((len(rows), table.memory.shape[-1]), dtype=torch.float64)
+        inputs = [*map(Rows, seen), Rows(table.parameters, rows), Rows(table.memory, rows)]
+        self._proposal(dt)(len(rows), inputs, [Rows(computed.T), Rows(unkept)])
+        return computed[_COMPUTED.index("proposed")]
+
     def _proposal(self, dt: float) -> RowFunction:
         """Returns the model's step of `dt` seconds as a function of vehicles' rows.
 
