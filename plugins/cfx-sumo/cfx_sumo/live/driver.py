@@ -498,8 +498,8 @@ class Driver:
             speed = taken.speed
             if turns is not None:
                 speed = np.minimum(speed, letting)
-                own = torch.from_numpy(speed)[turns.places]
-                turns = turns.one_step_later(own, clock.step)
+                of_turns = torch.from_numpy(speed)[turns.places]
+                turns = turns.one_step_later(of_turns, clock.step)
             self.counts.limited += int(np.count_nonzero(taken.is_limited[:count]))
             if taken.bound is not None:
                 hardest = np.maximum(hardest, taken.bound)

@@ -125,15 +125,15 @@ class Zippers:
         for coming in self._coming(connection).values():
             # The last one on another lane among those nearer to the line.
             other: Coming | None = None
-            for ahead, one in pairwise(sorted(coming)):
-                if ahead.before != one.before:
-                    other = ahead
+            for nearer, follower in pairwise(sorted(coming)):
+                if nearer.before != follower.before:
+                    other = nearer
                 if other is None:
                     continue
-                apart = one.distance - other.distance
-                faster = vehicle.getSpeed(one.name) - vehicle.getSpeed(other.name)
-                if apart > faster - vehicle.getDecel(one.name):
-                    behind[one.name] = (other.name, apart)
+                apart = follower.distance - other.distance
+                faster = vehicle.getSpeed(follower.name) - vehicle.getSpeed(other.name)
+                if apart > faster - vehicle.getDecel(follower.name):
+                    behind[follower.name] = (other.name, apart)
         return behind
 
     def _coming(self, connection: Connection) -> dict[str, list[Coming]]:
@@ -141,9 +141,9 @@ class Zippers:
         coming = defaultdict(list)
         for lane in self.lanes:
             for name in connection.lane.getLastStepVehicleIDs(lane):
-                found = _next_zipper(connection, lane, name)
-                if found is not None:
-                    coming[found[0]].append(found[1])
+                next_zipper = _next_zipper(connection, lane, name)
+                if next_zipper is not None:
+                    coming[next_zipper[0]].append(next_zipper[1])
         return coming
 
 
@@ -160,14 +160,14 @@ def _lanes_to_zippers(connection: Connection) -> dict[str, float]:
                 beyond[name] = 0.0
     newest = list(beyond)
     while newest:
-        found = []
+        farther = []
         for name in newest:
             for earlier, length in before[name]:
                 distance = beyond[name] + lane.getLength(name) + length
                 if distance < min(REACH_M, beyond.get(earlier, math.inf)):
                     beyond[earlier] = distance
-                    found.append(earlier)
-        newest = found
+                    farther.append(earlier)
+        newest = farther
     return beyond
 
 
