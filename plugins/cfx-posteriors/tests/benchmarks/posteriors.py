@@ -44,7 +44,7 @@ from cfx_posteriors.laplace import Normal, laplace, likely_starts
 from cfx_posteriors.neural import Learned, learn
 from cfx_posteriors.noise import RATE, SHAPE
 from cfx_posteriors.nuts import CHAINS, Chains, effective_samples, walk
-from cfx_posteriors.population import fit_population
+from cfx_posteriors.population import SAMPLES, fit_population
 
 from ..recordings import draw_recordings
 
@@ -505,15 +505,15 @@ def forecasts(name: str) -> Iterator[str]:
     starts = likely_starts(alone, seed=0)
     normal = laplace(alone, starts)
 
-    def sampled(posterior: Posterior, normal: Normal) -> Tensor:
-        return sample(posterior, normal, SHARES, seed=0, memory=1 << 30).draws
+    def sampled(posterior: Posterior, normal: Normal) -> Sampled:
+        return sample(posterior, normal, SHARES, seed=0, memory=1 << 30, draws=SAMPLES, apart=True)
 
-    _, within, pooled = fit_population(alone, normal, sampled)
+    _, likeliest, within = fit_population(alone, normal, sampled, SHARES, seed=0)
     drawn = {
         "likeliest": normal.mode[:, None].expand(-1, DRAWS, -1),
-        "posterior": sampled(alone, normal),
-        "likeliest within the population": pooled.mode[:, None].expand(-1, DRAWS, -1),
-        "posterior within the population": sampled(within, pooled),
+        "posterior": sample(alone, normal, SHARES, seed=0, memory=1 << 30).draws,
+        "likeliest within the population": likeliest[:, None].expand(-1, DRAWS, -1),
+        "posterior within the population": within.draws,
     }
     whole = posterior_of(solver, batch, last, settings, NOISE)
     for label, draws in drawn.items():
