@@ -64,6 +64,11 @@ _EVERY = 8
 _FREEDOM = 2.0
 """Degrees of freedom of the half t distributions: correlations are uniform then."""
 
+_MOST = 0.9
+"""Of the populations drawn, whose variances are exceeded by those that samples are made with: what
+no recording determines has a variance that is hardly known, and the middle of such variances is far
+below most."""
+
 _WIDER = 2.0
 """By how much the population that samples are made with has larger variances than those drawn:
 where samples are few, a population cannot come to be wide. With 1.5, and samples that were made
@@ -156,11 +161,13 @@ def fit_population(
 
 
 def _wider(population: Population) -> ParameterPrior:
-    """Returns a population that most of those drawn are within."""
-    scatter = torch.cov(population.mean.mT, correction=0).reshape(population.covariance.shape[1:])
-    among = torch.linalg.inv(population.middle.precision)
-    precision = torch.linalg.inv(_WIDER * (among + scatter))
-    return replace(population.middle, precision=precision)
+    """Returns a population that is wider than most of those drawn, with their correlations."""
+    middle = torch.linalg.inv(population.middle.precision)
+    of_draws = population.covariance.diagonal(dim1=1, dim2=2)
+    variances = of_draws.quantile(_MOST, dim=0) + population.mean.var(0)
+    ratio = (_WIDER * variances / middle.diagonal()).sqrt()
+    covariance = ratio[:, None] * middle * ratio
+    return replace(population.middle, precision=torch.linalg.inv(covariance))
 
 
 def _drawn(
