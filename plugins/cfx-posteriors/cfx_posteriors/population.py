@@ -114,7 +114,8 @@ class Population:
         shape = (drivers, self.mean.shape[1], 1)
         normal = torch.randn(shape, generator=generator, dtype=torch.float64)
         factor = torch.linalg.cholesky(self.covariance)[which]
-        return self.mean[which] + (factor @ normal)[..., 0]
+        logits: Tensor = self.mean[which] + (factor @ normal)[..., 0]
+        return logits
 
 
 def fit_population(
@@ -253,7 +254,8 @@ def _wishart(freedom: float, scale: Tensor, generator: torch.Generator) -> Tenso
     chi = 2.0 * torch._standard_gamma(shape, generator=generator)  # noqa: SLF001 - the only one with a generator
     lower = torch.randn((n, n), generator=generator, dtype=torch.float64).tril(-1)
     factor = torch.linalg.cholesky(scale) @ (lower + torch.diag(chi.sqrt()))
-    return factor @ factor.mT
+    drawn: Tensor = factor @ factor.mT
+    return drawn
 
 
 def _mean(
@@ -277,4 +279,5 @@ def _mean(
     normal = torch.randn(len(center), generator=generator, dtype=torch.float64)
     mean = torch.cholesky_solve(right[:, None], factor)[:, 0]
     away = torch.linalg.solve_triangular(factor.mT, normal[:, None], upper=True)[:, 0]
-    return mean + away
+    drawn: Tensor = mean + away
+    return drawn
