@@ -40,7 +40,7 @@ from cfx_posteriors.fan import Fan, fan_of
 from cfx_posteriors.importance import DRAWS, Sampled, sample
 from cfx_posteriors.laplace import Normal, laplace, likely_starts, log_evidence
 from cfx_posteriors.noise import NOISE_KINDS, noise_kind
-from cfx_posteriors.population import Population, fit_population
+from cfx_posteriors.population import SAMPLES, Population, fit_population
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -179,6 +179,10 @@ class PriorDrivers:
     space: ParameterSpace
     prior: ParameterPrior
 
+    def quantiles(self, shares: Tensor) -> Tensor:
+        """Returns quantiles of new drivers' logits, `(len(shares), n)`."""
+        return self.prior.quantiles(shares, len(self.space))
+
     def draw(self, drivers: int, *, seed: int) -> Tensor:
         """Returns parameters of new drivers, `(drivers, n)`, SI units."""
         logits = self.prior.draw(drivers, len(self.space), seed=seed)
@@ -281,13 +285,23 @@ class HierarchicalMethod(PosteriorMethod):
         with threads.one_thread():
             noise = choose_noise(solver, batch, last, best, settings)
 
-        def draw(posterior: Posterior, normal: Normal) -> Tensor:
-            return _sampled(solver, posterior, normal).draws
+        def draw(posterior: Posterior, normal: Normal) -> Sampled:
+            return sample(
+                posterior,
+                normal,
+                _shares(),
+                seed=solver.seed,
+                memory=solver.memory,
+                draws=SAMPLES,
+                apart=True,
+            )
 
         with threads.one_thread():
-            population, posterior, normal = fit_population(noise.posterior, noise.normal, draw)
-            sampled = _sampled(solver, posterior, normal)
-        return _intervals(solver, batch, last, noise, (posterior, normal.mode, population, sampled))
+            population, likeliest, sampled = fit_population(
+                noise.posterior, noise.normal, draw, _shares(), seed=solver.seed
+            )
+        places = (noise.posterior, likeliest, population, sampled)
+        return _intervals(solver, batch, last, noise, places)
 
 
 @dataclass(frozen=True)
@@ -391,7 +405,7 @@ def _intervals(
     posterior, likeliest, origin, sampled = posteriors
     space = solver.space
     shares = _shares()
-    prior = posterior.prior.quantiles(shares, len(space))
+    prior = origin.quantiles(shares)
     width = (sampled.quantiles[:, 2] - sampled.quantiles[:, 0]) / (prior[2] - prior[0])
     values = space.from_unit(torch.sigmoid(sampled.quantiles))
     low, median, high = values.unbind(1)

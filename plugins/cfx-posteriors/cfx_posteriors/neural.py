@@ -261,7 +261,7 @@ class _Round:
     def draw(self, generator: torch.Generator) -> Tensor:
         """Returns samples for the real recordings, `(P, N, d)`: the flow's, then wider ones."""
         standard = self.flow.sample((_OF_FLOW,), self.observed).transpose(0, 1).double()
-        return torch.cat([self.region.outer(standard), self.region.tails.draw(generator)], dim=1)
+        return torch.cat([self.region.outer(standard), self.region.tails.draw([generator])], dim=1)
 
     @torch.no_grad()
     def log_density(self, places: Tensor) -> Tensor:
@@ -331,8 +331,8 @@ def _learned(posterior: Posterior, shares: Tensor, seed: int, memory: int) -> Le
     trusted = (k <= MAX_PARETO_K)[:, None, None]
     weighted = weighted_quantiles(places[..., :n], smooth.exp(), shares)
     alone = weighted_quantiles(from_flow[..., :n], of_flow, shares)
-    draws = systematic(places, smooth.exp(), DRAWS, generator)
-    draws_alone = systematic(from_flow, of_flow, DRAWS, generator)
+    draws = systematic(places, smooth.exp(), DRAWS, [generator])
+    draws_alone = systematic(from_flow, of_flow, DRAWS, [generator])
     best = heights.argmax(dim=1)
     return Learned(
         torch.where(trusted, weighted, alone),

@@ -44,9 +44,11 @@ def draw_recordings(
     space = model.space
     prior = ParameterPrior.of(space, "weak")
     assert prior.center is not None
-    among = population or Population(space, prior.center, torch.linalg.inv(prior.precision))
+    among = population or Population(
+        space, prior.center[None], torch.linalg.inv(prior.precision)[None]
+    )
     normal = torch.randn((drivers, len(space)), generator=generator).double()
-    logits = among.mean + normal @ torch.linalg.cholesky(among.covariance).mT
+    logits = among.mean[0] + normal @ torch.linalg.cholesky(among.covariance[0]).mT
     correlation = torch.rand((drivers, 1), generator=generator).double() * 2.0 - 1.0
     gamma = -torch.log(torch.rand((drivers, 1), generator=generator).double())  # of shape 1
     scale = (noise.RATE / gamma).sqrt()

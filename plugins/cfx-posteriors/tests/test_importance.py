@@ -101,6 +101,22 @@ def test_samples_of_a_driver_depend_on_neither_memory_nor_other_drivers() -> Non
         torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
 
 
+def test_drivers_with_random_numbers_of_their_own_agree_within_errors() -> None:
+    posterior = draw_recordings(Krauss(), 3, frames=200).posterior
+    same = posterior.take(torch.tensor([0, 0, 0]))
+    normal = laplace(same, likely_starts(same, seed=0))
+    ends = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
+    shared = sample(same, normal, ends, seed=0, memory=1 << 30)
+    torch.testing.assert_close(shared.draws[0], shared.draws[1])
+    found = sample(same, normal, ends, seed=0, memory=1 << 30, draws=50, apart=True)
+    assert found.draws.shape[1] == 50
+    assert float((found.draws[0] - found.draws[1]).abs().mean()) > 0.01
+    width = shared.quantiles[:1, 2] - shared.quantiles[:1, 0]
+    assert float(((found.quantiles - shared.quantiles) / width[:, None]).abs().max()) < 0.15
+    cut = sample(same, normal, ends, seed=0, memory=1, draws=50, apart=True)
+    torch.testing.assert_close(cut.draws, found.draws, rtol=1e-6, atol=1e-6)
+
+
 def test_a_longer_recording_leaves_less_doubt() -> None:
     widths = []
     for frames in (150, 1200):

@@ -2,43 +2,105 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import pytest
 import torch
+from torch import Tensor
 
 from cfx.models.krauss import Krauss
+from cfx_posteriors import population
 from cfx_posteriors.density import Posterior
-from cfx_posteriors.importance import sample
+from cfx_posteriors.importance import DRAWS, Sampled, sample
 from cfx_posteriors.laplace import Normal, laplace
-from cfx_posteriors.population import Population, fit_population
+from cfx_posteriors.population import SAMPLES, Population, fit_population
 
 from .recordings import draw_recordings
 
 SPACE = Krauss().space
 TRUE = Population(
     SPACE,
-    torch.tensor([0.5, -1.0], dtype=torch.float64),
-    torch.tensor([[0.30, 0.18], [0.18, 0.20]], dtype=torch.float64),
+    torch.tensor([[0.5, -1.0]], dtype=torch.float64),
+    torch.tensor([[[0.30, 0.18], [0.18, 0.20]]], dtype=torch.float64),
 )
+SHARES = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
+DRIVERS, FEW = 60, 6
 
 
-def test_mean_and_covariance_are_found_and_drivers_are_nearer_to_the_truth() -> None:
-    drawn = draw_recordings(Krauss(), 60, frames=600, population=TRUE)
-    weak = drawn.posterior
-    assert weak.prior.center is not None
-    starts = weak.prior.center.expand(60, 1, -1)
+class Fitted(NamedTuple):
+    """A population of drivers `(P, n)`, and what is said of each."""
 
-    def draw(posterior: Posterior, normal: Normal) -> torch.Tensor:
-        half = torch.tensor([0.5], dtype=torch.float64)
-        return sample(posterior, normal, half, seed=0, memory=1 << 30).draws
+    truth: Tensor
+    alone: Normal
+    population: Population
+    likeliest: Tensor
+    within: Sampled
 
-    population, within, normal = fit_population(weak, laplace(weak, starts), draw)
-    torch.testing.assert_close(population.mean, TRUE.mean, atol=0.15, rtol=0)
-    torch.testing.assert_close(population.covariance, TRUE.covariance, atol=0.15, rtol=0)
-    assert within.prior.center is population.mean
-    truth = drawn.truth[:, :2]
-    alone = laplace(weak, starts).mode[:, :2]
-    error = (normal.mode[:, :2] - truth).square().mean()
-    assert float(error) < float((alone - truth).square().mean())
+
+def fitted(posterior: Posterior, truth: Tensor) -> Fitted:
+    assert posterior.prior.center is not None
+    alone = laplace(posterior, posterior.prior.center.expand(len(truth), 1, -1))
+
+    def draw(posterior: Posterior, normal: Normal) -> Sampled:
+        memory = 1 << 30
+        return sample(posterior, normal, SHARES, seed=0, memory=memory, draws=SAMPLES, apart=True)
+
+    of_all = fit_population(posterior, alone, draw, SHARES, seed=0)
+    return Fitted(truth[:, : len(SPACE)], alone, *of_all)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Fitted:
+    drawn = draw_recordings(Krauss(), DRIVERS, frames=600, population=TRUE)
+    return fitted(drawn.posterior, drawn.truth)
+
+
+def test_mean_and_covariance_are_found_and_drivers_are_nearer_to_the_truth(whole: Fitted) -> None:
+    middle = whole.population.middle
+    assert middle.center is not None
+    torch.testing.assert_close(middle.center, TRUE.mean[0], atol=0.15, rtol=0)
+    covariance = torch.linalg.inv(middle.precision)
+    torch.testing.assert_close(covariance, TRUE.covariance[0], atol=0.15, rtol=0)
+    error = (whole.likeliest[:, :2] - whole.truth).square().mean()
+    assert float(error) < float((whole.alone.mode[:, :2] - whole.truth).square().mean())
+
+
+def test_intervals_of_mean_scatter_and_drivers_hold_the_truth(whole: Fitted) -> None:
+    low, _, high = whole.within.quantiles.unbind(1)
+    held = (low <= whole.truth) & (whole.truth <= high)
+    assert 0.82 < float(held.double().mean()) < 0.97
+    ends = torch.tensor([0.005, 0.995], dtype=torch.float64)
+    for draws, true in (
+        (whole.population.mean, TRUE.mean[0]),
+        (whole.population.covariance.flatten(1), TRUE.covariance[0].flatten()),
+    ):
+        least, most = draws.quantile(ends, dim=0)
+        assert bool(((least < true) & (true < most)).all())
+    below = (whole.within.draws[..., :2] < whole.truth[:, None]).double().mean(1)
+    assert whole.within.draws.shape == (DRIVERS, DRAWS, 4)
+    assert bool((below[~held] < 0.08).logical_or(below[~held] > 0.92).all())
+
+
+def test_fewer_drivers_say_less_of_the_population(whole: Fitted) -> None:
+    drawn = draw_recordings(Krauss(), DRIVERS, frames=600, population=TRUE)
+    few = fitted(drawn.posterior.take(torch.arange(FEW)), drawn.truth[:FEW]).population
+    assert bool((few.mean.std(0) > 2.0 * whole.population.mean.std(0)).all())
+
+
+def test_without_drivers_deviations_are_half_t_and_correlations_uniform() -> None:
+    nobody, variances = torch.zeros((0, 2)).double(), torch.tensor([2.25, 9.0]).double()
+    generator = torch.Generator().manual_seed(0)
+    scales, draws = variances, []
+    for _ in range(8000):
+        covariance, scales = population._covariance(nobody, scales, variances, generator)
+        draws.append(covariance)
+    deviation = torch.stack(draws).diagonal(dim1=1, dim2=2).sqrt()
+    # Half of a t distribution with 2 degrees of freedom is within 0.8165.
+    median = deviation.median(0).values
+    torch.testing.assert_close(median, 0.8165 * variances.sqrt(), rtol=0.1, atol=0)
+    correlation = torch.stack(draws)[:, 0, 1] / deviation.prod(1)
+    quartiles = correlation.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64))
+    assert quartiles.tolist() == pytest.approx([-0.5, 0.0, 0.5], abs=0.05)
 
 
 def test_drawn_drivers_are_as_correlated_as_the_population_and_within_bounds() -> None:
@@ -46,6 +108,13 @@ def test_drawn_drivers_are_as_correlated_as_the_population_and_within_bounds() -
     low, high = SPACE.bounds().unbind(0)
     assert bool(((drawn > low) & (drawn < high)).all())
     logits = torch.logit(SPACE.to_unit(drawn))
-    torch.testing.assert_close(torch.cov(logits.mT), TRUE.covariance, atol=0.03, rtol=0)
+    torch.testing.assert_close(torch.cov(logits.mT), TRUE.covariance[0], atol=0.03, rtol=0)
     torch.testing.assert_close(TRUE.draw(5, seed=2), TRUE.draw(5, seed=2), rtol=0, atol=0)
-    assert TRUE.center.tolist() == pytest.approx(drawn.median(0).values.tolist(), rel=0.05)
+
+
+def test_new_drivers_differ_by_the_mean_that_is_not_known_too() -> None:
+    apart = torch.tensor([[-2.0, -2.0], [2.0, 2.0]], dtype=torch.float64)
+    narrow = 0.01 * torch.eye(2, dtype=torch.float64).expand(2, -1, -1)
+    logits = torch.logit(SPACE.to_unit(Population(SPACE, apart, narrow).draw(1000, seed=0)))
+    assert float((logits[:, 0] > 0).double().mean()) == pytest.approx(0.5, abs=0.06)
+    assert float(logits.abs().min()) > 1.0

@@ -1,6 +1,6 @@
 """How often 90 % intervals hold the truth, whatever the noise: what docs/how-to/uncertainty.md says.
 
-python -m plugins.cfx-posteriors.tests.benchmarks.coverage MODEL METHOD [DRIVERS] [SECONDS ...]
+python -m plugins.cfx-posteriors.tests.benchmarks.coverage MODEL METHOD [DRIVERS] [SECONDS ...] [--seed N]
 
 Drivers and noise are simulated by `simulated_drivers`, which shares no code with cfx; the kind of
 noise is left to `calibration.noise=chosen`.
@@ -8,7 +8,7 @@ noise is left to `calibration.noise=chosen`.
 
 from __future__ import annotations
 
-import sys
+import argparse
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import cast
@@ -32,17 +32,20 @@ from .simulated_drivers import simulate
 I80 = Path("../shared/data/i80_reconstructed_pairs.parquet")
 NOISES = ("trajectory", "acceleration", "measurement")
 SECONDS = (30.0, 60.0, 120.0)
+SEED = 7
 DRIVERS = {"krauss": 200, "idm": 120, "w99": 40}
 
 
-def rows(name: str, method: str, drivers: int, durations: Sequence[float]) -> Iterator[str]:
+def rows(
+    name: str, method: str, drivers: int, durations: Sequence[float], seed: int
+) -> Iterator[str]:
     """Yields a row of a Markdown table for each kind of noise and duration."""
     model = cast(DrivingModel, create("model", {"name": name}))
     names = list(model.space.names)
     yield f"| noise | s | chosen | held | settled | held by these | {' | '.join(names)} |"
     for noise in NOISES:
         for seconds in durations:
-            recordings, truth = simulate(name, noise, drivers, seconds, seed=7, recording=I80)
+            recordings, truth = simulate(name, noise, drivers, seconds, seed=seed, recording=I80)
             pairs = cfx.read(recordings, min_duration=0, check="off").selected
             batch = PairBatch.of(pairs, dtype=torch.float64)
             solver = Solver(MemoryStepper(model, batch.dt), RandomSearch(), seed=0)
@@ -66,8 +69,13 @@ def rows(name: str, method: str, drivers: int, durations: Sequence[float]) -> It
 
 if __name__ == "__main__":
     torch.set_num_threads(1)
-    model_name, method_name, *rest = sys.argv[1:]
-    count = int(rest[0]) if rest else DRIVERS[model_name]
-    lasting = [float(one) for one in rest[1:]] or list(SECONDS)
-    for line in rows(model_name, method_name, count, lasting):
+    parser = argparse.ArgumentParser()
+    parser.add_argument("model")
+    parser.add_argument("method")
+    parser.add_argument("drivers", type=int, nargs="?")
+    parser.add_argument("seconds", type=float, nargs="*", default=SECONDS)
+    parser.add_argument("--seed", type=int, default=SEED, help="of drivers and noise")
+    given = parser.parse_args()
+    count = given.drivers or DRIVERS[given.model]
+    for line in rows(given.model, given.method, count, given.seconds, given.seed):
         print(line, flush=True)

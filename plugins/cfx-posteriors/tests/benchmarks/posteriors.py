@@ -1,6 +1,6 @@
 """What docs/how-to/uncertainty.md says of `calibration.posterior`: coverage, I-80, time; ranks too.
 
-python -m plugins.cfx-posteriors.tests.benchmarks.posteriors coverage|recording|forecasts|chains|nuts|covered krauss|idm|w99
+python -m plugins.cfx-posteriors.tests.benchmarks.posteriors coverage|recording|forecasts|chains|nuts|tails|covered krauss|idm|w99
 python -m plugins.cfx-posteriors.tests.benchmarks.posteriors learned|beside krauss|idm|w99
 python -m plugins.cfx-posteriors.tests.benchmarks.posteriors reference idm
 python -m plugins.cfx-posteriors.tests.benchmarks.posteriors sumo krauss_sumo
@@ -44,7 +44,8 @@ from cfx_posteriors.laplace import Normal, laplace, likely_starts
 from cfx_posteriors.neural import Learned, learn
 from cfx_posteriors.noise import RATE, SHAPE
 from cfx_posteriors.nuts import CHAINS, Chains, effective_samples, walk
-from cfx_posteriors.population import fit_population
+from cfx_posteriors.population import SAMPLES, fit_population
+from cfx_posteriors.tempered import tempered
 
 from ..recordings import draw_recordings
 
@@ -237,6 +238,27 @@ def nuts(name: str) -> Iterator[str]:
         f" Laplace's approximation alone {float(of_normal.mean()):.2f}, {float(of_normal.max()):.1f};"
         f" effective samples of all drivers in a CPU second {float(effective.sum()) / spent:.1f}"
     )
+
+
+def tails(name: str) -> Iterator[str]:
+    """Yields how far the bounds of eight I-80 drivers are from those of many tempered samples."""
+    posterior = recorded(name, 8)
+    n = len(posterior.space)
+    many = torch.cat([tempered(posterior, seed)[..., :n] for seed in range(4)], dim=1)
+    bounds = many.quantile(SHARES[[0, 18]], dim=1).transpose(0, 1)
+    normal = laplace(posterior, likely_starts(posterior, seed=0))
+    off = []
+    for seed in range(100, 105):
+        found = sample(posterior, normal, SHARES, seed=seed, memory=1 << 30)
+        off.append((found.quantiles[:, [0, 18]] - bounds) / many.std(1)[:, None])
+    by_driver = torch.stack(off).mean(0)
+    for column, parameter in enumerate(posterior.space.names):
+        low, high = by_driver[..., column].unbind(1)
+        yield (
+            f"{type(MODELS[name]).__name__}'s {parameter}, deviations above tempered samples' bounds:"
+            f" 5 % {float(low.mean()):+.2f} ({float(low.min()):+.2f} to {float(low.max()):+.2f}),"
+            f" 95 % {float(high.mean()):+.2f} ({float(high.min()):+.2f} to {float(high.max()):+.2f})"
+        )
 
 
 def apart(found: Chains, quantiles: Tensor, n: int) -> Tensor:
@@ -505,15 +527,15 @@ def forecasts(name: str) -> Iterator[str]:
     starts = likely_starts(alone, seed=0)
     normal = laplace(alone, starts)
 
-    def sampled(posterior: Posterior, normal: Normal) -> Tensor:
-        return sample(posterior, normal, SHARES, seed=0, memory=1 << 30).draws
+    def sampled(posterior: Posterior, normal: Normal) -> Sampled:
+        return sample(posterior, normal, SHARES, seed=0, memory=1 << 30, draws=SAMPLES, apart=True)
 
-    _, within, pooled = fit_population(alone, normal, sampled)
+    _, likeliest, within = fit_population(alone, normal, sampled, SHARES, seed=0)
     drawn = {
         "likeliest": normal.mode[:, None].expand(-1, DRAWS, -1),
-        "posterior": sampled(alone, normal),
-        "likeliest within the population": pooled.mode[:, None].expand(-1, DRAWS, -1),
-        "posterior within the population": sampled(within, pooled),
+        "posterior": sample(alone, normal, SHARES, seed=0, memory=1 << 30).draws,
+        "likeliest within the population": likeliest[:, None].expand(-1, DRAWS, -1),
+        "posterior within the population": within.draws,
     }
     whole = posterior_of(solver, batch, last, settings, NOISE)
     for label, draws in drawn.items():
@@ -563,6 +585,7 @@ if __name__ == "__main__":
         "forecasts": forecasts,
         "chains": chains,
         "nuts": nuts,
+        "tails": tails,
         "covered": covered,
         "learned": learned,
         "beside": beside,

@@ -88,7 +88,7 @@ def draw_platoons(
     """
     figure = canvas.blank(4.3, width=10.5 if len(methods) > 1 else 6.5)
     grid = canvas.side_by_side(figure, [1] * len(methods), sharey=True, sharex=True)
-    speeds = [np.empty(0)]
+    speeds, collides = [np.empty(0)], False
     for axes, method in zip(grid, methods, strict=True):
         of_method = table[table["method"] == method]
         rows, _ = worst_platoon(of_method)
@@ -97,12 +97,13 @@ def draw_platoons(
             title.append(_stability(stable[method], int(of_method["network"].nunique())))
         title.append(f"last follower: {_slowing(rows)}")
         speeds += _draw_vehicles(axes, rows)
+        collides = collides or bool((rows["gap"] < 0).any())
         axes.set_title("\n".join(title), fontsize=canvas.points(9.5 if len(methods) < 4 else 7.5))
         axes.margins(x=0.01)
     figure.supxlabel(TIME_TITLE, fontsize=canvas.points(10.5))
     grid[0].set_ylabel("speed (m/s)")
     grid[0].set_ylim(*_speed_range(canvas.finite(np.concatenate(speeds))))
-    canvas.legend_above(figure, _handles(), 4, columnspacing=1.8)
+    canvas.legend_above(figure, _handles(collides), 4, columnspacing=1.8)
     return figure
 
 
@@ -137,13 +138,15 @@ def _speed_range(values: canvas.Array) -> tuple[float, float]:
     return float(values.min()) - margin, float(values.max()) + margin
 
 
-def _handles() -> list[Line2D]:
-    return [
+def _handles(collides: bool) -> list[Line2D]:
+    handles = [
         Line2D([], [], color=colours.COLOURS["real"], linewidth=2.0, label="leader"),
         Line2D([], [], color=canvas.vehicle_colour(1, 10), linewidth=1.6, label="first follower"),
         Line2D([], [], color=canvas.vehicle_colour(10, 10), linewidth=1.6, label="last follower"),
-        Line2D([], [], linestyle="none", label="collision", **_COLLISION),
     ]
+    if collides:
+        handles.append(Line2D([], [], linestyle="none", label="collision", **_COLLISION))
+    return handles
 
 
 class PlatoonSpeeds(JobFigure):

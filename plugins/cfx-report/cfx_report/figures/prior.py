@@ -71,5 +71,5 @@ class PriorStrengths(JobFigure):
         if not priors:
             return None
         unit = (result.data.get("objective") or {}).get("unit", "")
-        label = f"held-out error, {unit}" if unit else "held-out error"
+        label = f"held-out error ({unit})" if unit else "held-out error"
         return draw_strengths(priors, label)

@@ -32,7 +32,7 @@ def test_it_shows_what_was_tried_and_what_was_taken(result: Result) -> None:
     assert np.asarray(curve.get_xdata()).tolist() == [0.1, 0.3, 1.0]
     assert np.asarray(curve.get_ydata()).tolist() == [0.6, 0.5, 0.7]
     assert np.asarray(taken.get_xdata())[0] == 0.2
-    assert axes.get_ylabel() == "held-out error, m/s"
+    assert axes.get_ylabel() == "held-out error (m/s)"
 
 
 def test_nothing_is_drawn_where_nothing_was_chosen(result: Result) -> None:

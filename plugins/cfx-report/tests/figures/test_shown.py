@@ -139,6 +139,10 @@ def test_platoons_show_speeds_collisions_and_verdicts() -> None:
         title = axes.get_title(loc="left")
         assert verdict in title
         assert "last follower: " in title
+    hits = any(len(line.get_xdata()) == 1 for axes in figure.axes for line in axes.lines)
+    named = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert named[:3] == ["leader", "first follower", "last follower"]
+    assert ("collision" in named) == hits
     low, high = figure.axes[0].get_ylim()
     speeds = np.concatenate([line.get_ydata() for axes in figure.axes for line in axes.lines])
     assert low < speeds.min() < speeds.max() < high
