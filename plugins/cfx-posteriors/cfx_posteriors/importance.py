@@ -270,7 +270,8 @@ def _finished(
             components = Components(*(values[on] for values in components))
             normal = Normal(*(values[on] for values in normal))
             if len(generators) > 1:
-                generators = [one for one, goes_on in zip(generators, on, strict=True) if goes_on]
+                places = on.nonzero()[:, 0].tolist()
+                generators = [generators[place] for place in places]
         new = _adapted(posterior, samples, normal, generators)
         together = zip(components, new, strict=True)
         components = Components(*(torch.cat(values, dim=1) for values in together))
