@@ -277,10 +277,7 @@ def pairs_from(source: PairsLike, settings: Mapping[str, Any] | None = None) -> 
     Raises:
         ConfigError: the pairs have been read already, so that a setting of `data` does nothing.
     """
-    settings = settings or {}
-    of_data = dict(settings)
-    for key in without_data(settings):
-        del of_data[key]
+    of_data = {key: value for key, value in (settings or {}).items() if _is_of_data(key)}
     if isinstance(source, Pairs | PairSet):
         if of_data:
             key, value = next(iter(of_data.items()))

@@ -52,8 +52,8 @@ names = list(placed)
 view = look(libsumo, names, 200.0)
 zippers = Zippers(libsumo)
 turns = zippers.turns(libsumo, view.names, view.seen)
-found = [view.names[place] for place in turns.places.tolist()]
-gaps = dict(zip(found, turns.seen.gap.tolist()))
+waiting = [view.names[place] for place in turns.places.tolist()]
+gaps = dict(zip(waiting, turns.seen.gap.tolist()))
 at = {name: libsumo.vehicle.getLanePosition(name) for name in names}
 libsumo.close()
 start(ASSETS / "streets.net.xml", "left0A0 A0B0", {})

@@ -249,8 +249,8 @@ def tails(name: str) -> Iterator[str]:
     normal = laplace(posterior, likely_starts(posterior, seed=0))
     off = []
     for seed in range(100, 105):
-        found = sample(posterior, normal, SHARES, seed=seed, memory=1 << 30)
-        off.append((found.quantiles[:, [0, 18]] - bounds) / many.std(1)[:, None])
+        sampled = sample(posterior, normal, SHARES, seed=seed, memory=1 << 30)
+        off.append((sampled.quantiles[:, [0, 18]] - bounds) / many.std(1)[:, None])
     by_driver = torch.stack(off).mean(0)
     for column, parameter in enumerate(posterior.space.names):
         low, high = by_driver[..., column].unbind(1)

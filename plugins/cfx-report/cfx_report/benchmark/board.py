@@ -298,7 +298,7 @@ def _saved_rows(path: Path) -> list[Entered]:
         of_row = dict(list(errors.groupby("row", sort=False)))
         entered = []
         for row in rows:
-            entered.append(Entered(row, of_row[row.name].reset_index(drop=True), path.parent))
+            entered.append(Entered(row, of_row[row.name].reset_index(drop=True), path))
     except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:
         raise DataError(
             f"{path}: is no file of rows, as cfx benchmark table --save writes it ({error})"

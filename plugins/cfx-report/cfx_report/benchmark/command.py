@@ -224,10 +224,12 @@ class TableCommand(Command):
 
     def parse(self, arguments: Sequence[str]) -> argparse.Namespace:
         """Reads the command line."""
+        from cfx_report.benchmark.board import SAVED
+
         parser = self.parser()
         options = parser.parse_args(list(arguments))
-        if options.save is not None and options.save.suffix != ".parquet":
-            parser.error(f"--save {options.save}: give the file a name that ends in .parquet")
+        if options.save is not None and options.save.suffix != SAVED:
+            parser.error(f"--save {options.save}: give the file a name that ends in {SAVED}")
         return options
 
     def run(self, options: argparse.Namespace) -> int:

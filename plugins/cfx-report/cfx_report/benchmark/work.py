@@ -248,8 +248,8 @@ def _fold(entry: Entry, training: Training, number: int) -> dict[str, dict[str, 
         )
         seconds = {"train": trained - began, "drive": driven - trained}
         files.write_json(done, {"seconds": seconds, "flows": flows})
-    learned: dict[str, dict[str, float]] = json.loads(done.read_text(encoding="utf-8"))
-    return learned
+    measured: dict[str, dict[str, float]] = json.loads(done.read_text(encoding="utf-8"))
+    return measured
 
 
 def _cpu_seconds() -> float:
