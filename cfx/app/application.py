@@ -248,10 +248,7 @@ def _exit_code(error: BaseException, arguments: Sequence[str], show_traceback: b
         # Hydra exits with 0 after --help and the like, with 1 or argparse's 2 after a message about
         # a wrong flag.
         return 2 if error.code else 0
-    overrides = []
-    for argument in arguments:
-        if not argument.startswith("-"):
-            overrides.append(argument)
+    overrides = [argument for argument in arguments if not argument.startswith("-")]
     if isinstance(error, Refused):
         return _report(error.__cause__, overrides, show_traceback)
     signalled = signal_behind(error)

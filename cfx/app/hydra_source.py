@@ -258,10 +258,7 @@ def plain(config: DictConfig) -> dict[str, Any]:
     Raises:
         OmegaConfBaseException: an interpolation leads nowhere.
     """
-    groups = []
-    for key in config:
-        if key != "hydra":
-            groups.append(str(key))
+    groups = [str(key) for key in config if key != "hydra"]
     job = OmegaConf.masked_copy(config, groups)
     with resolving(config):
         return cast("dict[str, Any]", OmegaConf.to_container(job, resolve=True))

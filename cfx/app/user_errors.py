@@ -175,10 +175,7 @@ def _unknown_name(key: str, typed: str, node: DictConfig, right: Sequence[str]) 
     mapping = OverridesParser.create().parse_override(typed).value()
     if not isinstance(mapping, dict):
         return ""
-    unknown = []
-    for name in map(str, mapping):
-        if name not in node:
-            unknown.append(name)
+    unknown = [name for name in map(str, mapping) if name not in node]
     if not unknown:
         return ""
     sentence = _unknown_key(f"{key}.{unknown[0]}", right)

@@ -243,10 +243,7 @@ def _put_logging(before: Any) -> None:
     if logging.getLogger().manager.disable != disabled_below:
         logging.disable(disabled_below)
     for logger, handlers, filters, (level, disabled, propagate) in parts:
-        added = []
-        for handler in logger.handlers:
-            if handler not in handlers:
-                added.append(handler)
+        added = [handler for handler in logger.handlers if handler not in handlers]
         logger.handlers[:], logger.filters[:] = handlers, filters
         logger.disabled, logger.propagate = disabled, propagate
         if logger.level != level:

@@ -301,11 +301,7 @@ def entry(kind: str, name: str) -> Entry:
 
 def _of_name(kind: str, name: str) -> list[Entry]:
     """Returns the entries of a name, of whatever distribution."""
-    same_name = []
-    for announced in entries(kind):
-        if announced.name == name:
-            same_name.append(announced)
-    return same_name
+    return [announced for announced in entries(kind) if announced.name == name]
 
 
 def _that_count(claims: list[Entry]) -> list[Entry]:
@@ -510,10 +506,7 @@ def rivals(announced: Entry) -> tuple[Entry, ...]:
     """
     if announced.distribution == OWN:
         return ()
-    others = []
-    for other in _of_name(announced.kind, announced.name):
-        if other != announced:
-            others.append(other)
+    others = [other for other in _of_name(announced.kind, announced.name) if other != announced]
     return tuple(_that_count(others))
 
 
@@ -524,10 +517,7 @@ def other_api(announced: Entry) -> str:
     """
     if announced.distribution == OWN or not announced.api or str(API_VERSION) in announced.api:
         return ""
-    versions = []
-    for declared in announced.api:
-        if declared.isdecimal():
-            versions.append(int(declared))
+    versions = [int(declared) for declared in announced.api if declared.isdecimal()]
     if not versions:
         return (
             f"{announced} declares '{announced.api[0]}' as its version of cfx's plugin API, which"

@@ -72,10 +72,7 @@ def judge(pairs: PairSet, check: Check, units: Units | None = None) -> Verdict:
         return Verdict("")
     broken = list(contradictions(pairs, units))
     names = tuple(dict(broken))
-    sentences = []
-    for remark in pairs.remarks:
-        if remark.is_contradiction:
-            sentences.append(remark.text)
+    sentences = [remark.text for remark in pairs.remarks if remark.is_contradiction]
     is_common = bool(sentences)
     if broken:
         sentences.append(_of_pairs(pairs, broken, units))
@@ -140,10 +137,7 @@ def check_pairs(
 def _without(pairs: PairSet, names: Sequence[str]) -> PairSet:
     """Returns the pairs that are not named."""
     left_out = frozenset(names)
-    coherent = []
-    for number, pair in enumerate(pairs.pairs):
-        if pair.pair_id not in left_out:
-            coherent.append(number)
+    coherent = [number for number, pair in enumerate(pairs.pairs) if pair.pair_id not in left_out]
     return pairs.take(coherent)
 
 

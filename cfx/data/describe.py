@@ -484,11 +484,7 @@ def _without_length(pairs: PairSet) -> list[str]:
 
 def _with_length(pairs: Sequence[Pair]) -> list[Pair]:
     """Returns the pairs whose leader's length is known."""
-    with_length = []
-    for pair in pairs:
-        if pair.leader_length > 0:
-            with_length.append(pair)
-    return with_length
+    return [pair for pair in pairs if pair.leader_length > 0]
 
 
 def _overview(layout: str, contents: Contents, units: Mapping[str, str]) -> Table:

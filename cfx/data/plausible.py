@@ -90,10 +90,7 @@ def rare(pairs: PairSet) -> Iterator[str]:
             yield f"{counted}: {advice}"
     backwards = list(_counted(pairs, "steps in which a vehicle moves backwards", _goes_back))
     for counted in backwards:
-        backing = []
-        for pair in pairs:
-            if _goes_back(pair).any():
-                backing.append(pair)
+        backing = [pair for pair in pairs if _goes_back(pair).any()]
         if all(map(follows_from_gaps, backing)):
             yield (
                 f"{counted}: positions follow from the leader's speed and the gap here, so this is"

@@ -200,10 +200,7 @@ class Layout:
         first = missing[0]
         called = " or ".join(first.written)
         of_layout = {column.title for column in self.columns}
-        spare = []
-        for name in names:
-            if name not in of_layout:
-                spare.append(name)
+        spare = [name for name in names if name not in of_layout]
         where = source
         if self.above:
             where += f", row {self.above + 1}"
@@ -345,10 +342,7 @@ def read_table(path: Path, layout: Layout, labels: Mapping[str, str] | None = No
         for name in stored:
             more.pop(name, None)
         matches = layout.found_in(str(path), [*stored, *more])
-        used = []
-        for match in matches.values():
-            if match.at < len(stored):
-                used.append(stored[match.at])
+        used = [stored[match.at] for match in matches.values() if match.at < len(stored)]
         columns = file.read(columns=used)
         for name, value in more.items():
             columns = columns.append_column(name, pa.array([value] * len(columns)))

@@ -334,8 +334,5 @@ class Evaluation:
 def _in_order(methods: pd.Series) -> tuple[str, ...]:
     """Returns the methods of a column, each once, in the order of `METHODS`."""
     compared = set(methods.unique())
-    in_order = []
-    for method in METHODS:
-        if method in compared:
-            in_order.append(method)
+    in_order = [method for method in METHODS if method in compared]
     return tuple(in_order)

@@ -352,10 +352,7 @@ def ranking_of(
     for other in ranked[1:]:
         key = ranked[0], other
         against.append(Against(*key, compared[key], corrected[key]))
-    not_comparable = []
-    for name in errors:
-        if name not in ranked:
-            not_comparable.append(name)
+    not_comparable = [name for name in errors if name not in ranked]
     mean_errors = tuple(means[name] for name in ranked)
     return Ranking(tuple(ranked), mean_errors, len(tested), tuple(against), tuple(not_comparable))
 

@@ -79,10 +79,7 @@ def reads_the_parameters_that_it_declares(model: DrivingModel) -> None:
         if name != "parameters" and model.settings.__dict__[name] != default:
             return  # a variant may leave some out
     names = model.parameters.for_settings(model.settings).names
-    unread = []
-    for name in names:
-        if name not in p.read:
-            unread.append(name)
+    unread = [name for name in names if name not in p.read]
     assert not unread, (
         f"it declares {len(names)} tuned parameters ({', '.join(names)}),"
         f" but next_speed never reads {', '.join(unread)}"

@@ -296,10 +296,7 @@ class Result:
         """
         if self.purpose is Purpose.POLICY:
             return ("policy",)
-        constant = []
-        for method in self.methods:
-            if method != "policy":
-                constant.append(method)
+        constant = [method for method in self.methods if method != "policy"]
         if self.purpose is Purpose.CALIBRATION and constant:
             return tuple(constant)
         return self.methods

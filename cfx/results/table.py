@@ -164,11 +164,7 @@ class ResultTable(Component):
 
     def _columns_of(self, dtype: str) -> list[str]:
         """Returns the names of the columns of a type."""
-        names = []
-        for column in self.columns:
-            if column.dtype == dtype:
-                names.append(column.name)
-        return names
+        return [column.name for column in self.columns if column.dtype == dtype]
 
 
 class Tables(Mapping[str, pd.DataFrame]):

@@ -75,10 +75,7 @@ def overrides_of(words: Sequence[str]) -> list[str]:
         has_named_columns |= word.startswith(("data.columns", "data.units"))
         keys.add(key)
         typed.append(word)
-    overrides = []
-    for key, value in _CHOSEN.items():
-        if key not in keys:
-            overrides.append(f"{key}={value}")
+    overrides = [f"{key}={value}" for key, value in _CHOSEN.items() if key not in keys]
     if files and "data" not in keys:
         from cfx.data.describe import dataset_of
 

@@ -137,10 +137,7 @@ class SweepSummary:
 
     def _name(self, job: SweptJob) -> str:
         """Returns what differs between jobs, besides the seed."""
-        parts = []
-        for key in self.differing:
-            if key != "seed":
-                parts.append(f"{key}={job.overrides.get(key, '')}")
+        parts = [f"{key}={job.overrides.get(key, '')}" for key in self.differing if key != "seed"]
         return " ".join(parts)
 
     @cached_property

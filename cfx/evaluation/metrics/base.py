@@ -296,10 +296,7 @@ class MetricSet:
     @classmethod
     def own(cls) -> MetricSet:
         """Makes cfx's own metrics."""
-        metrics = []
-        for entry in registry.entries("metric"):
-            if entry.distribution == OWN:
-                metrics.append(made(entry))
+        metrics = [made(entry) for entry in registry.entries("metric") if entry.distribution == OWN]
         return cls(in_order(metrics))
 
 

@@ -131,10 +131,7 @@ class FinishedPolicy:
                 f" {pairs.dt:g} s; set data.time_step={policy.dt:g}"
             )
         learned_from = LearnedFrom(policy.trained_on.pairs)
-        learned_pairs = []
-        for pair in pairs:
-            if pair in learned_from:
-                learned_pairs.append(pair.pair_id)
+        learned_pairs = [pair.pair_id for pair in pairs if pair in learned_from]
         if learned_pairs:
             raise DataError(
                 f"{where}: this policy has learned from {len(learned_pairs)} of the {len(pairs)}"
@@ -210,10 +207,7 @@ class FoldsOrFinished(AcrossDrivers):
         min_duration = self.settings.min_test_duration
         if min_duration is None:
             return context
-        long = []
-        for number, pair in enumerate(context.pairs):
-            if pair.lasts(min_duration):
-                long.append(number)
+        long = [number for number, pair in enumerate(context.pairs) if pair.lasts(min_duration)]
         if not long:
             raise DataError(
                 f"no pair in {context.pairs.source} lasts"

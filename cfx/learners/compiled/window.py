@@ -53,10 +53,7 @@ class NamedElementwise:
         together: int | None = None,
     ) -> None:
         self.names = [name for name, width in widths.items() if width > 0]
-        numbers = []
-        for name in differentiated:
-            if name in self.names:
-                numbers.append(self.names.index(name))
+        numbers = [self.names.index(name) for name in differentiated if name in self.names]
 
         def of_values(*values: Tensor) -> Sequence[Tensor]:
             empty = values[0][..., :0]

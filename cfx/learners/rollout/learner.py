@@ -184,10 +184,7 @@ class RolloutLearner(Learner):
         curves = pd.concat([shard.curves for shard in in_order], ignore_index=True)
         curves = curves.sort_values("epoch", kind="stable", ignore_index=True)
         warn_of_nothing_learned(curves)
-        factors = []
-        for shard in in_order:
-            if shard.dispersion is not None:
-                factors.append(shard.dispersion)
+        factors = [shard.dispersion for shard in in_order if shard.dispersion is not None]
         dispersion = None
         if factors:
             # The geometric mean of an ensemble's members.

@@ -35,10 +35,7 @@ def trained_head(learner: str) -> Callable[[str], str]:
     """Returns the check of a learner's setting `head`: it is one that the learner trains."""
 
     def check(name: str) -> str:
-        trained = []
-        for head in registry.names("head"):
-            if learner in head_class(head).learners:
-                trained.append(head)
+        trained = [head for head in registry.names("head") if learner in head_class(head).learners]
         if name not in trained:
             raise ValueError(f"should be one of {', '.join(trained)}")
         return name

@@ -94,10 +94,7 @@ def pair_panels(
         parameters: in the order in which the trajectory has them.
     """
     time = trajectory.time
-    present = []
-    for method in methods:
-        if method in trajectory.speed:
-            present.append(method)
+    present = [method for method in methods if method in trajectory.speed]
     speed_lines = [canvas.Line("leader", time, trajectory.leader_speed)]
     speed_lines += _lines(time, trajectory.real_speed, trajectory.speed, present)
     gap_lines = _lines(time, trajectory.real_gap, trajectory.gap, present)
@@ -283,10 +280,7 @@ def draw_parameters(pair: PairPanels, methods: Sequence[str]) -> Figure:
     # The speeds take the cells that the parameters leave over, so that the grid has no hole.
     span = rows * columns - count
     speeds = figure.add_subplot(grid[0, :span])
-    lines = []
-    for line in pair.speed.lines:
-        if line.method in {"leader", "real", "policy"}:
-            lines.append(line)
+    lines = [line for line in pair.speed.lines if line.method in {"leader", "real", "policy"}]
     canvas.draw_lines(speeds, lines)
     speeds.set_title(pair.speed.title)
     panels = [speeds]
@@ -348,11 +342,7 @@ def _legend(figure: Figure, methods: Sequence[str], title: str | None = None) ->
 
 def _visible(methods: Sequence[str]) -> list[str]:
     """Returns the methods that figures show."""
-    visible = []
-    for method in methods:
-        if method not in canvas.HIDDEN:
-            visible.append(method)
-    return visible
+    return [method for method in methods if method not in canvas.HIDDEN]
 
 
 def draw_panel(axes: Axes, panel: Panel) -> None:

@@ -291,10 +291,7 @@ def _experiment_lines(client: MlflowClient, names: dict[str, str], address: str)
     """Returns a page for each experiment that holds jobs, or for each if none does."""
     from cfx.results.mlflow.tracker import common_error
 
-    used = []
-    for experiment in names:
-        if client.search_runs([experiment], max_results=1):
-            used.append(experiment)
+    used = [experiment for experiment in names if client.search_runs([experiment], max_results=1)]
     lines = []
     for experiment in used or names:
         chosen = "tags.`cfx.sweep_parent` IS NULL"

@@ -551,10 +551,7 @@ def _begin(store: Store, name: str, parameters: Mapping[str, str], tags: Mapping
         run, logged = client.create_run(store.experiment_id, run_name=name, tags=cleaned), {}
     run_id = str(run.info.run_id)
     try:
-        missing = []
-        for key, value in parameters.items():
-            if key not in logged:
-                missing.append(Param(key, value))
+        missing = [Param(key, value) for key, value in parameters.items() if key not in logged]
         client.log_batch(run_id, params=missing, tags=_tags(tags))
         folder = _local(run.info.artifact_uri)
         if folder is not None:

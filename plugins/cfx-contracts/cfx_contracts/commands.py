@@ -30,10 +30,7 @@ def it_has_a_summary_of_one_line(command: Command) -> None:
 
 
 def every_argument_has_help(command: Command) -> None:
-    bare = []
-    for action in _actions(command.parser()):
-        if not action.help:
-            bare.append(action.dest)
+    bare = [action.dest for action in _actions(command.parser()) if not action.help]
     assert not bare, f"each argument says what it is, in `help=`; {', '.join(bare)} does not"
 
 

@@ -79,10 +79,7 @@ def every_parameter_says_what_it_is(model: DrivingModel) -> None:
 
 
 def constants_can_be_tuned_and_tuned_parameters_fixed(model: DrivingModel) -> None:
-    constants = []
-    for parameter in model.space:
-        if not parameter.tuned:
-            constants.append(parameter.name)
+    constants = [parameter.name for parameter in model.space if not parameter.tuned]
     everything = _with_tuned(model, dict.fromkeys(constants, True))
     assert set(everything.space.names) == {parameter.name for parameter in model.space}, (
         "`model.parameters.NAME.tuned=true` must turn a constant into a tuned parameter; build"
@@ -100,10 +97,7 @@ def every_tuned_parameter_changes_a_trajectory(model: DrivingModel) -> None:
     require_equations(model)
     for variant, said in _variants(model):
         moved = _largest_changes(variant)
-        dead = []
-        for name, change in moved.items():
-            if change < _FELT:
-                dead.append(name)
+        dead = [name for name, change in moved.items() if change < _FELT]
         assert not dead, (
             f"{', '.join(dead)} changes no trajectory{said}, from bound to bound behind leaders in"
             " stop-and-go and on a free road: whatever calibration finds for it is arbitrary"
@@ -189,10 +183,7 @@ def gradients_are_right(model: DrivingModel) -> None:
         raise NotApplicable("the model does not claim to be differentiable")
     states = ordinary(model)
     follower, leader, p = states
-    names = []
-    for name, value in p.items():
-        if value.dim():
-            names.append(name)
+    names = [name for name, value in p.items() if value.dim()]
 
     def step(*inputs: Tensor) -> Tensor:
         states, values = inputs[:5], inputs[5:]

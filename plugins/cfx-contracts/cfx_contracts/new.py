@@ -102,10 +102,7 @@ def _check_name(kind: registry.Kind, name: str) -> None:
             f"'{name}' cannot be a component's name: it must be an identifier in lower-case"
             f" letters, digits and _{advice}"
         )
-    taken = []
-    for entry in registry.entries(kind.name):
-        if entry.name == name:
-            taken.append(entry)
+    taken = [entry for entry in registry.entries(kind.name) if entry.name == name]
     if taken:
         raise PluginError(
             f"the name '{name}' is taken by {taken[0]}: a second {kind.name} of that name would be"

@@ -117,10 +117,7 @@ def saved_equals_loaded(policy: Policy) -> None:
 def a_trainable_policy_has_gradients(policy: Policy) -> None:
     network = _network(policy)
     tokens = random_tokens(policy)
-    parameters = []
-    for parameter in network.parameters():
-        if parameter.requires_grad:
-            parameters.append(parameter)
+    parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
     assert bool(parameters) == policy.trainable, (
         "`trainable` must say whether there is anything to train: labels and training cost a job"
         " its time"

@@ -101,10 +101,7 @@ def all_methods_drive_the_same_frames(protocol: Protocol) -> None:
 def the_table_has_a_row_for_each_pair_and_method(protocol: Protocol) -> None:
     evaluation = _protocol_result(protocol).evaluation
     parameters = [f"parameter_{name}" for name in evaluation.names]
-    missing = []
-    for name in (*_COLUMNS, *parameters):
-        if name not in evaluation.table:
-            missing.append(name)
+    missing = [name for name in (*_COLUMNS, *parameters) if name not in evaluation.table]
     assert not missing, (
         f"reports, figures and `cfx report` read these columns of the table: {', '.join(missing)}"
     )

@@ -86,10 +86,7 @@ def _prepare(figure: Figure) -> list[str]:
         if points > _MANY_POINTS:
             artist.set_rasterized(True)
     for axes in figure.axes:
-        pale = []
-        for line in axes.lines:
-            if line.get_alpha() is not None:
-                pale.append(line)
+        pale = [line for line in axes.lines if line.get_alpha() is not None]
         if len(pale) > _MANY_LINES:
             for line in pale:
                 line.set_rasterized(True)

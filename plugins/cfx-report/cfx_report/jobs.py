@@ -26,11 +26,7 @@ class Runs:
 
 def of_purpose(jobs: Iterable[Result], *purposes: Purpose) -> list[Result]:
     """Returns the jobs that have one of these purposes."""
-    chosen = []
-    for job in jobs:
-        if job.purpose in purposes:
-            chosen.append(job)
-    return chosen
+    return [job for job in jobs if job.purpose in purposes]
 
 
 def are_calibrations(jobs: Iterable[Result]) -> bool:

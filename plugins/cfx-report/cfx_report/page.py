@@ -196,10 +196,7 @@ def _counts(jobs: Sequence[Result]) -> str:
         ("driver_specific", f"Of {len(jobs)} jobs"),
         ("pooled", "against pooled calibration"),
     ):
-        sides = []
-        for job in jobs:
-            if baseline in job.baselines():
-                sides.append(_side(job, baseline))
+        sides = [_side(job, baseline) for job in jobs if baseline in job.baselines()]
         if sides:
             yes, no, undecided = map(sides.count, ("yes", "no", "undecided"))
             sentences.append(f"{against}: yes in {yes}, no in {no}, undecided in {undecided}")

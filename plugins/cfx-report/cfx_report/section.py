@@ -97,10 +97,7 @@ def lacking(jobs: tuple[Result, ...], file: str, what: str) -> str:
         file: its name.
         what: what cannot be shown without it.
     """
-    without = []
-    for job in jobs:
-        if file in job.missing:
-            without.append(job.name)
+    without = [job.name for job in jobs if file in job.missing]
     if not without:
         return ""
     reason = "an older version of cfx wrote it, or the file was removed"
@@ -181,11 +178,7 @@ class Sheet:
 
     def explained(self) -> list[Column[Any]]:
         """Returns the columns that have something to explain."""
-        explained = []
-        for column in self.columns:
-            if column.meaning:
-                explained.append(column)
-        return explained
+        return [column for column in self.columns if column.meaning]
 
 
 def text(value: object) -> Cell:

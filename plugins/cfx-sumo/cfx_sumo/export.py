@@ -121,10 +121,7 @@ def vtypes(node: Mapping[str, Any], table: pd.DataFrame) -> tuple[VType, list[st
     """
     model = cast(DrivingModel, registry.create("model", node))
     columns = [f"parameter_{name}" for name in model.space.names]
-    missing = []
-    for column in columns:
-        if column not in table:
-            missing.append(column)
+    missing = [column for column in columns if column not in table]
     if missing:
         raise DataError(
             f"pairs.csv has no column {missing[0]}, which model={node['name']} here needs; run the"

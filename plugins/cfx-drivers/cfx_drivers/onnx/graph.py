@@ -71,11 +71,7 @@ class _Step(nn.Module):
 
 def kept_of(step: DriverStep) -> list[str]:
     """Returns the names of what drivers of this policy remember: the state that is not empty."""
-    kept = []
-    for name, value in step.begin(1)._asdict().items():
-        if value.numel():
-            kept.append(name)
-    return kept
+    return [name for name, value in step.begin(1)._asdict().items() if value.numel()]
 
 
 def signals_of(step: DriverStep) -> dict[str, tuple[str, str]]:

@@ -27,10 +27,7 @@ def read_errors(path: Path) -> pd.DataFrame:
         table = pd.read_csv(path)
     except (OSError, ValueError, UnicodeDecodeError) as error:
         raise DataError(f"{path}: cannot be read as CSV ({error})") from None
-    missing = []
-    for name in (*_NEEDED, "protocol"):
-        if name not in table.columns:
-            missing.append(name)
+    missing = [name for name in (*_NEEDED, "protocol") if name not in table.columns]
     if missing:
         raise DataError(
             f"{path}: column {missing[0]} is missing; --against takes the benchmark_pairs.csv that"

@@ -498,10 +498,7 @@ def _stress_lines(stress: dict[str, Any]) -> list[str]:
 
 
 def _pairs(values: dict[str, Any]) -> str:
-    parts = []
-    for name, value in values.items():
-        if value is not None:
-            parts.append(f"{name} {value:.3g}")
+    parts = [f"{name} {value:.3g}" for name, value in values.items() if value is not None]
     return ", ".join(parts)
 
 

@@ -130,10 +130,7 @@ def labels_of(
         the window, as a share of the 90 % quantile over all windows (0 is arbitrary), and
         `fixed_NAME`, the driver-specific parameters.
     """
-    names = []
-    for axis in axes:
-        if f"parameter_{axis.name}" in labels:
-            names.append(axis.name)
+    names = [axis.name for axis in axes if f"parameter_{axis.name}" in labels]
     if labels.empty or not names:
         return {}
     driver_specific = (
@@ -244,10 +241,7 @@ def draw_labels(pair_id: str, labels: pd.DataFrame, axes: Sequence[ParameterAxis
         labels: as `labels_of` returns it for the pair.
         axes: the tuned parameters.
     """
-    shown = []
-    for axis in axes:
-        if f"fixed_{axis.name}" in labels:
-            shown.append(axis)
+    shown = [axis for axis in axes if f"fixed_{axis.name}" in labels]
     figure = canvas.blank(1.0 + 1.15 * (len(shown) + 1))
     grid = figure.subplots(len(shown) + 1, 1, sharex=True)
     times = labels["time_s"].to_numpy(dtype=float)

@@ -58,10 +58,7 @@ class ErrorDistribution(JobFigure):
 
     def draw(self, result: Result) -> Figure | None:
         """Draws it where several pairs were driven by calibrated parameters or a policy."""
-        methods = []
-        for method in result.shown_methods:
-            if method not in canvas.HIDDEN:
-                methods.append(method)
+        methods = [method for method in result.shown_methods if method not in canvas.HIDDEN]
         if result.pairs["pair_id"].nunique() < _FEWEST or set(methods) <= {"default"}:
             return None
         return draw_error_distribution(result.pairs, methods)

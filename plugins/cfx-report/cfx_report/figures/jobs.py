@@ -163,10 +163,7 @@ def draw_clusters(groups: Sequence[ClusterGroup], axis: improvement_bars.Improve
     present: set[str] = set()
     for group in groups:
         present |= set(group.clusters)
-    order = []
-    for cluster in style.CLUSTERS:
-        if cluster in present:
-            order.append(cluster)
+    order = [cluster for cluster in style.CLUSTERS if cluster in present]
     width = 0.8 / max(len(groups), 1)
     handles = []
     for k, group in enumerate(groups):

@@ -169,10 +169,7 @@ class PlatoonSpeeds(JobFigure):
         if table is None:
             return None
         simulated = set(table["method"])
-        methods = []
-        for method in result.shown_methods:
-            if method in simulated:
-                methods.append(method)
+        methods = [method for method in result.shown_methods if method in simulated]
         if not methods:
             return None
         stable = {}

@@ -62,10 +62,7 @@ def draw_intervals(rows: pd.DataFrame, axes: Sequence[ParameterAxis]) -> Figure:
     for place in grid.flat:
         for handle, text in zip(*place.get_legend_handles_labels(), strict=True):
             handles.setdefault(text, handle)
-    in_order = []
-    for words, _, _ in _KINDS:
-        if words in handles:
-            in_order.append(handles[words])
+    in_order = [handles[words] for words, _, _ in _KINDS if words in handles]
     canvas.legend_above(figure, in_order)
     figure.supxlabel(
         canvas.wrapped(
@@ -268,10 +265,7 @@ class PosteriorIntervals(JobFigure):
         if fits is None:
             return None
         rows = interval_rows(fits)
-        axes = []
-        for axis in result.parameters:
-            if f"median_{axis.name}" in rows:
-                axes.append(axis)
+        axes = [axis for axis in result.parameters if f"median_{axis.name}" in rows]
         return draw_intervals(rows, axes) if len(rows) and axes else None
 
 
@@ -294,10 +288,7 @@ class PosteriorPairs(JobFigure):
             return None
         pair_id = _middle(interval_rows(fits))
         of_pair = draws[draws["pair_id"].astype(str) == pair_id]
-        axes = []
-        for axis in result.parameters:
-            if f"parameter_{axis.name}" in of_pair:
-                axes.append(axis)
+        axes = [axis for axis in result.parameters if f"parameter_{axis.name}" in of_pair]
         prior = result.tables.get("population", result.tables.get("prior"))
         return draw_pairs(pair_id, of_pair, axes, prior) if len(of_pair) and axes else None
 

@@ -115,10 +115,7 @@ def _called(group: style.Group) -> str:
 
 def _matrix(axes: Axes, shown: Sequence[style.Group], distances: pd.DataFrame | None) -> None:
     """Draws the distances between the scores of sites; pale where chance may explain them."""
-    sites = []
-    for group in shown:
-        if group.driver_type == style.ALL_TYPES:
-            sites.append(group.site)
+    sites = [group.site for group in shown if group.driver_type == style.ALL_TYPES]
     number = {site: index for index, site in enumerate(sites)}
     matrix = np.full((len(sites), len(sites)), np.nan)
     p_values = np.ones_like(matrix)

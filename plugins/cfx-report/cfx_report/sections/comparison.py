@@ -164,10 +164,7 @@ def closeness(jobs: Sequence[Result]) -> Sheet:
         (wording.FULL_TRAJECTORY, "Full trajectories: the same"),
     ):
         for method in METHODS:
-            showing = []
-            for job in jobs:
-                if method in job.shown_methods:
-                    showing.append(job)
+            showing = [job for job in jobs if method in job.shown_methods]
             if any_has_metric(showing, judge.name, method, scope):
                 meaning = f"Error over {frames[scope]}, with {wording.explained(method)}."
                 cell = partial(_error, metrics=(judge.name, other), scope=scope, method=method)

@@ -243,10 +243,7 @@ What lies outside a parameter's bounds is shaded.
 
     def context(self, runs: Runs) -> Mapping[str, Any]:
         """Return the jobs that kept their trajectories, and what is shown of their pairs."""
-        jobs = []
-        for job in runs.jobs:
-            if "trajectories" in job.tables:
-                jobs.append(job)
+        jobs = [job for job in runs.jobs if "trajectories" in job.tables]
         constant = of_purpose(jobs, Purpose.CALIBRATION)
         shown = {
             "chosen": chosen_pairs,

@@ -193,10 +193,7 @@ def per_cluster(series: Series, baselines: Sequence[str]) -> dict[str, View]:
         column = f"improvement/{baseline}"
         groups = []
         for name, by_cluster in series.items():
-            tables = []
-            for table in by_cluster.values():
-                if column in table:
-                    tables.append(table)
+            tables = [table for table in by_cluster.values() if column in table]
             if tables:
                 groups.append(_group(name, pd.concat(tables, ignore_index=True), column))
         every = np.concatenate([np.empty(0), *(group.values for group in groups)])

@@ -41,10 +41,7 @@ class PaperSection(Section):
         paper = published()
         experiments = []
         for experiment, about in paper["experiments"].items():
-            jobs = []
-            for job in runs.jobs:
-                if job.setting("preset") == experiment:
-                    jobs.append(job)
+            jobs = [job for job in runs.jobs if job.setting("preset") == experiment]
             if "ranked" in about:
                 jobs = _ranked(jobs, about["ranked"])
             if jobs:

@@ -170,10 +170,7 @@ def _typed(job: Result, jobs: Sequence[Result]) -> dict[str, str]:
     if len(jobs) == 1:
         return {"Command": _command(job.overrides)}
     shared = _shared_overrides(jobs)
-    of_job = []
-    for override in job.overrides:
-        if override not in shared:
-            of_job.append(override)
+    of_job = [override for override in job.overrides if override not in shared]
     return {
         "Command": f"{_command(shared)} …",
         "Overrides of its own": job_folder.without_folders(shlex.join(of_job)) or "none",
@@ -187,10 +184,7 @@ def _command(overrides: Sequence[str]) -> str:
 
 def _shared_overrides(jobs: Sequence[Result]) -> list[str]:
     """Returns the overrides that all jobs with known overrides have, in order."""
-    typed = []
-    for job in jobs:
-        if job.overrides is not None:
-            typed.append(job.overrides)
+    typed = [job.overrides for job in jobs if job.overrides is not None]
     shared = []
     for override in typed[0]:
         if all(override in other for other in typed):

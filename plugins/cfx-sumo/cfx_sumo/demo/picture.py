@@ -37,10 +37,7 @@ def write_pictures(
         OutputError: a file cannot be written.
     """
     middle = simulated[len(simulated) // 2]
-    together = []
-    for one in simulated:
-        if one.scene == middle.scene:
-            together.append(one)
+    together = [one for one in simulated if one.scene == middle.scene]
     picture = drawing.write_figure(snapshots(road, middle, together), folder / "demo.png")
     trajectories = pair_lines.drives(Result.of(evaluation), [one.pair.pair_id for one in simulated])
     return [picture, drawing.write_figure(trajectories, folder / "demo_drives.png")]

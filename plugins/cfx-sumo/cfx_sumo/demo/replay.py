@@ -214,10 +214,7 @@ def _simulate(
         try:
             for frame in range(max(road.frames for road in roads)):
                 sumo.simulationStep()
-                present = []
-                for road in roads:
-                    if frame < road.frames:
-                        present.append(road)
+                present = [road for road in roads if frame < road.frames]
                 _frame(sumo, present, frame, drivers, chosen)
         finally:
             sumo.close()

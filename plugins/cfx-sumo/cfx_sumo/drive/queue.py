@@ -79,10 +79,7 @@ class QueueAtLight:
 
     def _standing(self, vehicle: Any, on: set[str]) -> list[str]:
         """Returns the queue, first vehicle first, and notes its gaps."""
-        queue = []
-        for name in sorted(on):
-            if vehicle.getSpeed(name) < _QUEUED_MPS:
-                queue.append(name)
+        queue = [name for name in sorted(on) if vehicle.getSpeed(name) < _QUEUED_MPS]
         queue.sort(key=vehicle.getLanePosition, reverse=True)
         for ahead, behind in pairwise(queue):
             if vehicle.getSpeed(behind) < _STANDS_MPS:
