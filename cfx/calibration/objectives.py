@@ -106,9 +106,7 @@ class Objective(Component):
             counted: 1 (or True) for frames that count and 0 for others, broadcasting to the frames.
             dim: the dimension of time, of the frames and of `counted` alike.
         """
-        total = []
-        for term in self.terms(frames):
-            total.append((term * counted).sum(dim))
+        total = [(term * counted).sum(dim) for term in self.terms(frames)]
         return tuple(total)
 
     def __call__(

@@ -352,9 +352,7 @@ def _reduce(
     finite = losses.isfinite()
     lowest = losses.amin(dim=1, keepdim=True)
     ties = finite & (losses <= lowest + tolerance + TIE_ABSOLUTE + TIE_RELATIVE * lowest.abs())
-    distances = []
-    for block in blocks:
-        distances.append(_squared_distance(block, guesses[:, 0]))
+    distances = [_squared_distance(block, guesses[:, 0]) for block in blocks]
     distance = torch.cat(distances, dim=1)
     # Among candidates that tie, the nearest to the first guess: what the recording does not tell
     # apart stays where it was expected.

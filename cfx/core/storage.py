@@ -57,10 +57,7 @@ def local_copies(url: str) -> list[Path]:
             paths = sorted(system.glob(path))
         if not paths:
             raise DataError(f"data.path={url}: no file matches this pattern")
-        copies = []
-        for file in paths:
-            copies.append(_copy(system, file))
-        return copies
+        return [_copy(system, file) for file in paths]
 
 
 def local_folder(url: str) -> Path:

@@ -287,9 +287,7 @@ class Dataset(Component):
                     " two such steps; give a shorter one"
                 )
         selected = _select_first(_select_long(pairs, self.settings.min_duration), self.settings)
-        as_recorded = []
-        for pair in selected.pairs:
-            as_recorded.append(recorded[pair.pair_id])
+        as_recorded = [recorded[pair.pair_id] for pair in selected.pairs]
         verdict = check_pairs(
             replace(selected, pairs=tuple(as_recorded)),
             self.settings.check,

@@ -215,9 +215,7 @@ def describe_style(style: StyleResult, distances: pd.DataFrame | None) -> str:
             name = f"  {row['driver_type']}"
         if np.isfinite(row["score_low"]):
             interval = f"{row['score_low']:.3f} to {row['score_high']:.3f}"
-        medians = []
-        for indicator in INDICATORS:
-            medians.append(f"{row[indicator.name]:.2f}")
+        medians = [f"{row[indicator.name]:.2f}" for indicator in INDICATORS]
         score = f"{row['score_median']:.3f}"
         table.add_row(name, str(row["drivers"]), score, interval, *medians)
     pieces: list[RenderableType] = [table]
@@ -450,9 +448,7 @@ def _advice(pairs: Sequence[tuple[int, float]], usual: float) -> tuple[str, list
     step = float(recorded_steps.max())
     if recorded_steps.min() < step:
         options = f" data.time_step={step:g}"
-    in_steps = []
-    for frames, dt in pairs:
-        in_steps.append(frames_in_steps(frames, dt, step))
+    in_steps = [frames_in_steps(frames, dt, step) for frames, dt in pairs]
     durations = np.sort(np.array(in_steps) * step)
     median = float(durations[(len(durations) - 1) // 2])
     min_duration = usual

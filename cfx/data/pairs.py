@@ -92,9 +92,7 @@ class Pair:
     def __post_init__(self) -> None:
         for name in ("pair_id", "recording", "leader_id", "follower_id"):
             object.__setattr__(self, name, name_of(getattr(self, name)))
-        shapes = {}
-        for name in RECORDED:
-            shapes[name] = getattr(self, name).shape
+        shapes = {name: getattr(self, name).shape for name in RECORDED}
         for signal, values in self.surroundings.items():
             shapes[signal.name] = values.shape
         if len(set(shapes.values())) != 1 or len(shapes["leader_position"]) != 1:
@@ -411,16 +409,12 @@ class PairSet(Sequence[Pair]):
             copy[:] = array
             return copy
 
-        pairs = []
-        for pair in self:
-            pairs.append(pair.with_arrays(stored))
+        pairs = [pair.with_arrays(stored) for pair in self]
         return replace(self, pairs=tuple(pairs))
 
     def take(self, numbers: Sequence[int]) -> PairSet:
         """Returns the pairs at these places; nothing is counted as left out."""
-        pairs = []
-        for number in numbers:
-            pairs.append(self.pairs[number])
+        pairs = [self.pairs[number] for number in numbers]
         return replace(self, pairs=tuple(pairs))
 
     def select(self, keep: Sequence[bool], reason: str) -> PairSet:

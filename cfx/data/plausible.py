@@ -170,9 +170,7 @@ _RARE: Mapping[str, tuple[Callable[[Pair], Marks], str]] = {
 
 def _counted(pairs: PairSet, what: str, wrong: Callable[[Pair], Marks]) -> Iterator[str]:
     """Yields how many frames are wrong and where most of them are; nothing if none is."""
-    counts = []
-    for pair in pairs:
-        counts.append(int(np.count_nonzero(wrong(pair))))
+    counts = [int(np.count_nonzero(wrong(pair))) for pair in pairs]
     if any(counts):
         worst = pairs[int(np.argmax(counts))].pair_id
         yield (

@@ -68,9 +68,7 @@ def _pair(pair: Pair, step: float) -> Pair | None:
     signals = dict(zip(RECORDED, values[: len(RECORDED)], strict=True))
     surroundings = dict(zip(pair.surroundings, values[len(RECORDED) :], strict=True))
     before = np.floor(at + _ROUNDING).astype(np.int64)
-    truth = {}
-    for name, value in pair.truth.items():
-        truth[name] = np.asarray(value)[before]
+    truth = {name: np.asarray(value)[before] for name, value in pair.truth.items()}
     return replace(pair, dt=step, truth=truth, surroundings=surroundings, **signals)
 
 

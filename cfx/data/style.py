@@ -213,9 +213,7 @@ def indicators(pairs: PairSet) -> pd.DataFrame:
     """
     import pandas as pd
 
-    parts = []
-    for whole_drivers in _by_driver(pairs):
-        parts.append(_indicators(whole_drivers))
+    parts = [_indicators(whole_drivers) for whole_drivers in _by_driver(pairs)]
     return pd.concat(parts, ignore_index=True)
 
 

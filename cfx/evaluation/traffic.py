@@ -302,9 +302,7 @@ def recorded_flows(reference: str | Path) -> RecordedFlows:
     place, _, kind = name.partition("#")
     try:
         tables = json.loads(Path(place).expanduser().read_text(encoding="utf-8"))["relations"]
-        relations = {}
-        for each, table in tables.items():
-            relations[each] = relation_from(table)
+        relations = {each: relation_from(table) for each, table in tables.items()}
         if not kind:
             kind = max(relations, key=lambda each: int(relations[each].drivers.sum()))
         return RecordedFlows(kind or place, relations[kind])

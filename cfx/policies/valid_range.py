@@ -90,9 +90,7 @@ class ValidRange(NamedTuple):
     @classmethod
     def of(cls, situations: Sequence[Tensor]) -> ValidRange:
         """Measures situations `(S, f)` of each network, in double precision."""
-        measured = []
-        for learned in situations:
-            measured.append(_measured(learned.double()))
+        measured = [_measured(learned.double()) for learned in situations]
         return cls(*(torch.stack(column) for column in zip(*measured, strict=True)))
 
     def of_drivers(self, network: Tensor) -> ValidRange:

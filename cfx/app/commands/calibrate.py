@@ -85,8 +85,6 @@ def overrides_of(words: Sequence[str]) -> list[str]:
     if len(files) == 1:
         overrides.append(path_override("data.path", files[0]))
     elif files:
-        paths = []
-        for file in files:
-            paths.append(path_override("", file).removeprefix("="))
+        paths = [path_override("", file).removeprefix("=") for file in files]
         overrides.append(f"data.path=[{','.join(paths)}]")
     return [*overrides, *typed]

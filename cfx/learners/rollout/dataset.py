@@ -552,9 +552,7 @@ def _validation_drivers(
     held_out, has_few_drivers = torch.zeros_like(present), torch.zeros(len(pair), dtype=torch.bool)
     for network in range(len(pair)):
         places = present[network].nonzero()[:, 0].tolist()
-        driver_at = {}
-        for place in places:
-            driver_at[place] = drivers[int(pair[network, place])]
+        driver_at = {place: drivers[int(pair[network, place])] for place in places}
         names = sorted(set(driver_at.values()))
         has_few_drivers[network] = len(names) < _FEW_DRIVERS
         if has_few_drivers[network] or validation == 0:

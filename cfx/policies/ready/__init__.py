@@ -21,9 +21,7 @@ READY_FOLDER = Path(__file__).resolve().parent / "policies"
 
 def names() -> tuple[str, ...]:
     """Returns the names of all ready-made policies, sorted."""
-    cards = []
-    for card in READY_FOLDER.glob("*/card.json"):
-        cards.append(card.parent.name)
+    cards = [card.parent.name for card in READY_FOLDER.glob("*/card.json")]
     return tuple(sorted(cards))
 
 

@@ -192,9 +192,7 @@ def _kernel(
     corrected: bool = False,
 ) -> _Kernel | None:
     """Returns the kernel for a model and an objective, made at the first call."""
-    varied = []
-    for name, value in p.items():
-        varied.append((name, value.dim() > 0))
+    varied = [(name, value.dim() > 0) for name, value in p.items()]
     key = KernelKey(
         model=model_key(model),
         temperature=float(model.temperature),
@@ -270,9 +268,7 @@ def _run(
     """
     problems, candidates = sums.shape[-2:]
     ends = _ends(segments.counted)
-    signals = []
-    for name in SIGNALS:
-        signals.append(_signal(getattr(segments, name)))
+    signals = [_signal(getattr(segments, name)) for name in SIGNALS]
     views = (_TensorView * len(signals))(*signals)
     values = [_parameter(value, problems, candidates) for value in parameters]
     parameter_views = (_TensorView * len(values))(*values)

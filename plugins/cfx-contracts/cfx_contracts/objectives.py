@@ -110,9 +110,7 @@ def parts_add_up_to_the_whole(objective: Objective) -> None:
     for k in range(1, FRAMES):
         step = _sums_of_frame(objective, k)
         assert len(step) == len(sums), "terms returns as many tensors in every call"
-        added = []
-        for total, term in zip(sums, step, strict=True):
-            added.append(total + term)
+        added = [total + term for total, term in zip(sums, step, strict=True)]
         sums = tuple(added)
     expect_close(
         objective.finish(sums, counted.sum(0)),
