@@ -17,6 +17,7 @@ from cfx.policies.checkpoint import save_agent
 from cfx_sumo.demo.motorway import SHIPPED
 from cfx_sumo.drive.run import (
     Collision,
+    CollisionCounts,
     ScenarioRun,
     Tally,
     command_line,
@@ -315,7 +316,7 @@ Path("cross.sumocfg").write_text(f'''<configuration><input><net-file value="{tow
   <route-files value="cross.rou.xml"/></input><processing><collision.action value="warn"/>
   </processing></configuration>''')
 run = run_scenario(Path("cross.sumocfg"), {"car": "cfx://idm"}, end=60, step=0.5, speed_mode=0)
-print(json.dumps([run.tallies["car"].crossings, run.crossings_of_sumo]))
+print(json.dumps([run.tallies["car"].crossings, run.collisions_of_sumo]))
 """
 
 
@@ -323,7 +324,36 @@ def test_crossing_paths_are_counted_beside_those_of_sumo_alone(tmp_path: Path, l
     """Drivers without SUMO's checks run red lights; SUMO's own do not."""
     crossings, of_sumo = python(live, RUNS_RED_LIGHTS, tmp_path)
     assert crossings > 0
-    assert of_sumo == 0
+    assert of_sumo == [0, 0]
+
+
+SHORT_EDGE = """
+import sys
+sys.modules["pyarrow"] = None
+import json
+from pathlib import Path
+from cfx_sumo.drive.run import run_scenario
+from cfx_sumo.simulation.network import network
+Path("short.net.xml").write_text(network(1, 1, length=0.1, speed=10.0, apart=10.0))
+Path("short.rou.xml").write_text('''<routes><vType id="car" length="4.5" minGap="2.5" sigma="0"/>
+  <route id="r" edges="road0"/>
+  <vehicle id="a" type="car" route="r" depart="0"><stop lane="road0_0" endPos="0.1" duration="60"/>
+  </vehicle><vehicle id="b" type="car" route="r" depart="2"/></routes>''')
+Path("short.sumocfg").write_text('''<configuration><input><net-file value="short.net.xml"/>
+  <route-files value="short.rou.xml"/></input><processing><collision.action value="warn"/>
+  </processing></configuration>''')
+run = run_scenario(Path("short.sumocfg"), {"car": "cfx://idm"}, end=6, step=0.5)
+print(json.dumps([[str(one) for one in run.collisions], run.collisions_of_sumo]))
+"""
+
+
+def test_who_was_inserted_onto_another_is_said(tmp_path: Path, live: Forks) -> None:
+    """SUMO inserts vehicles where the edge is shorter than they are, with any driver."""
+    collisions, of_sumo = python(live, SHORT_EDGE, tmp_path)
+    assert len(collisions) == 1
+    assert "b behind a on road0_0" in collisions[0]
+    assert "where SUMO has just inserted it: contact, gap -" in collisions[0]
+    assert of_sumo == [1, 0]
 
 
 OUT_OF_ORDER = f"""
@@ -394,7 +424,7 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
             Collision(4.0, "calm", "b", "x", "road_0", 80.0, 2.391),
             Collision(4.5, "calm", "a", "y", ":n_0", 3.0, None, crossing=True),
         ],
-        crossings_of_sumo=6,
+        collisions_of_sumo=CollisionCounts(behind=0, crossing=6),
         left_out=[f"ignoring 'flow{number}'!" for number in range(12)],
     )
     report(run)
@@ -408,8 +438,8 @@ def test_the_table_says_it_all(capsys: pytest.CaptureFixture[str]) -> None:
     assert "4.00 s: b behind x on road_0 at 80.0 m: below minGap, gap 2.39 m" in out
     assert "4.50 s: a and y, whose paths cross, on :n_0 at 3.0 m" in out
     assert "left out by SUMO: ignoring 'flow9'!\n... and 2 more vehicles and flows left out" in out
-    assert "paths cross at a junction: 5; where SUMO's own models drive all" in out
-    assert "in the same scenario: 6" in out
+    assert "Collisions: 1 with the vehicle ahead, 5 where paths cross; where SUMO's own" in out
+    assert "in the same scenario: 0 with the vehicle ahead, 6 where paths cross" in out
     assert "calm: RMSE of speed below 1.20 m/s" in out
     assert "calm: 3 % of steps outside what the policy has learned (speed above 18 m/s)" in out
     assert next(line.split() for line in out.splitlines() if "its recording" in line)[2:5] == [

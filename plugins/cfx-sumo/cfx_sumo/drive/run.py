@@ -138,6 +138,8 @@ class Collision:
         position: of the collider's front on it, m.
         gap: the smallest, from bumper to bumper, m; None: not known, as where paths cross.
         crossing: whether their paths cross at a junction; otherwise one is behind the other.
+        inserted: whether SUMO has just put the collider there, as it does on an edge that is
+            shorter than a vehicle.
     """
 
     time: float
@@ -148,6 +150,7 @@ class Collision:
     position: float
     gap: float | None
     crossing: bool = False
+    inserted: bool = False
 
     @property
     def contact(self) -> bool:
@@ -167,10 +170,27 @@ class Collision:
         gap = "gap not known"
         if self.gap is not None:
             gap = f"gap {self.gap:.2f} m"
+        where = ", where SUMO has just inserted it" if self.inserted else ""
         return (
             f"{self.time:.2f} s: {self.collider} behind {self.victim} on {self.lane} at"
-            f" {self.position:.1f} m: {what}, {gap}"
+            f" {self.position:.1f} m{where}: {what}, {gap}"
         )
+
+
+class CollisionCounts(NamedTuple):
+    """How many collisions there were with contact.
+
+    Attributes:
+        behind: of a vehicle and the one ahead of it.
+        crossing: of vehicles whose paths cross at a junction.
+    """
+
+    behind: int
+    crossing: int
+
+    def __str__(self) -> str:
+        """Returns both in words."""
+        return f"{self.behind} with the vehicle ahead, {self.crossing} where paths cross"
 
 
 @dataclass(frozen=True)
@@ -194,8 +214,8 @@ class ScenarioRun:
         expected: for each vType, what error of speed to expect of its policy, in words; "" where
             that is not known.
         collisions: that SUMO reported of driven vehicles, in their order.
-        crossings_of_sumo: how many of vehicles whose paths cross SUMO has in the same scenario
-            where its own models drive all; None where there was nothing to compare with it.
+        collisions_of_sumo: how many SUMO has in the same scenario where its own models drive all;
+            None where there was nothing to compare with them.
         left_out: what SUMO says of the vehicles and flows of the scenario that it left out.
         fleets: for each vType, in words, who drives its vehicles.
     """
@@ -212,7 +232,7 @@ class ScenarioRun:
     recorded: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)
     expected: Mapping[str, str] = field(default_factory=dict)
     collisions: Sequence[Collision] = ()
-    crossings_of_sumo: int | None = None
+    collisions_of_sumo: CollisionCounts | None = None
     left_out: Sequence[str] = ()
     fleets: Mapping[str, str] = field(default_factory=dict)
 
@@ -290,19 +310,19 @@ def run_scenario(
                 ) from error
         run = replace(run, left_out=left_out(log))
         _check_on_the_road(run, path)
-        has_crossings = any(collision.crossing for collision in run.collisions)
-        if not has_crossings and observer is None:
+        has_contact = any(collision.contact for collision in run.collisions)
+        if not has_contact and observer is None:
             return run
         plain = Observer()
         command = command_line(path, sumo_options, step=step, seed=seed)
         with started(path, command, gui=False) as connection:
-            crossings = _crossings_of_sumo(connection, fleet, run.steps, make_actor(), plain)
+            of_sumo = _collisions_of_sumo(connection, fleet, run.steps, make_actor(), plain)
         if observer is not None and report_to is not None:
             both = ScenarioReport(observer.observations(), plain.observations())
             write_report(both, report_to)
-        if not has_crossings:
+        if not has_contact:
             return run
-        return replace(run, crossings_of_sumo=crossings)
+        return replace(run, collisions_of_sumo=of_sumo)
 
 
 def _check_on_the_road(run: ScenarioRun, scenario: Path) -> None:
@@ -320,10 +340,10 @@ def _check_on_the_road(run: ScenarioRun, scenario: Path) -> None:
         )
 
 
-def _crossings_of_sumo(
+def _collisions_of_sumo(
     sumo: Any, fleet: Fleet, steps: int, actor: Actor | None, observer: Observer
-) -> int:
-    """Returns how many collisions of crossing paths a scenario has without drivers of cfx.
+) -> CollisionCounts:
+    """Returns how many collisions with contact a scenario has without drivers of cfx.
 
     Args:
         sumo: that has just started the scenario.
@@ -332,7 +352,7 @@ def _crossings_of_sumo(
         actor: acts on the simulation besides.
         observer: looks at the vehicles.
     """
-    total = 0
+    behind = crossing = 0
     before: set[tuple[str, str]] = set()
     with Task("The same without cfx's drivers", steps) as task:
         for _ in range(steps):
@@ -344,12 +364,29 @@ def _crossings_of_sumo(
             for reported in sumo.simulation.getCollisions():
                 is_driven = fleet.has_type(reported.colliderType)
                 is_driven |= fleet.has_type(reported.victimType)
-                if is_driven and _is_crossing(reported):
-                    touching.add((reported.collider, reported.victim))
-            total += len(touching - before)  # a collision that lasts for steps counts once
+                if not is_driven:
+                    continue
+                pair = reported.collider, reported.victim
+                if _is_crossing(reported):
+                    crossing += pair not in before  # one that lasts for steps counts once
+                else:
+                    gap = _gap_on_lane(sumo, reported)
+                    if gap is not None and gap > 0.0:
+                        continue
+                    behind += pair not in before
+                touching.add(pair)
             before = touching
             task.advance()
-    return total
+    return CollisionCounts(behind, crossing)
+
+
+def _gap_on_lane(sumo: Any, reported: Any) -> float | None:
+    """Returns the gap of a collision by the places of both on the lane, m; None: not known."""
+    vehicle, victim = sumo.vehicle, reported.victim
+    if victim not in vehicle.getIDList() or vehicle.getLaneID(victim) != reported.lane:
+        return None
+    rear = vehicle.getLanePosition(victim) - vehicle.getLength(victim)
+    return float(rear - reported.pos)
 
 
 def _is_crossing(reported: Any) -> bool:
@@ -782,6 +819,7 @@ class _Run:
     def _note_collisions(self, dt: float) -> None:
         """Notes the collisions that SUMO reports after a step; one that goes on is one."""
         now = self._sumo.simulation.getTime()
+        departed = self._sumo.simulation.getDepartedIDList()
         touching = {}
         for reported in self._sumo.simulation.getCollisions():
             kind = self._type_of.get(reported.collider) or self._type_of.get(reported.victim)
@@ -791,8 +829,16 @@ class _Run:
             collision, gap_before = self._touching.get(key), self._gap_before(*key)
             if collision is None:
                 gap = self._gap(reported, gap_before, dt)
-                crossing = _is_crossing(reported)
-                collision = Collision(now, kind, *key, reported.lane, reported.pos, gap, crossing)
+                collision = Collision(
+                    now,
+                    kind,
+                    *key,
+                    reported.lane,
+                    reported.pos,
+                    gap,
+                    crossing=_is_crossing(reported),
+                    inserted=reported.collider in departed,
+                )
                 self._collisions.append(collision)
             elif collision.gap is not None and gap_before is not None:
                 # SUMO goes on to report the speeds of the first step.
@@ -817,11 +863,7 @@ class _Run:
             return None  # their paths cross, or they meet head-on
         if gap_before is not None:
             return float(gap_before + (reported.victimSpeed - reported.colliderSpeed) * dt)
-        vehicle, victim = self._sumo.vehicle, reported.victim
-        if victim not in vehicle.getIDList() or vehicle.getLaneID(victim) != reported.lane:
-            return None
-        rear = vehicle.getLanePosition(victim) - vehicle.getLength(victim)
-        return float(rear - reported.pos)
+        return _gap_on_lane(self._sumo, reported)
 
     def _count_teleports(self) -> None:
         for name in self._sumo.simulation.getStartingTeleportIDList():
@@ -927,11 +969,12 @@ def report(run: ScenarioRun) -> None:
         print(f"left out by SUMO: {sentence}")
     if len(run.left_out) > _LISTED:
         print(f"... and {len(run.left_out) - _LISTED} more vehicles and flows left out")
-    if run.crossings_of_sumo is not None:
+    if run.collisions_of_sumo is not None:
+        behind = sum(tally.collisions for tally in run.tallies.values())
         crossings = sum(tally.crossings for tally in run.tallies.values())
         print(
-            f"Collisions of vehicles whose paths cross at a junction: {crossings}; where SUMO's own"
-            f" models drive all of them in the same scenario: {run.crossings_of_sumo}"
+            f"Collisions: {CollisionCounts(behind, crossings)}; where SUMO's own models drive all"
+            f" of them in the same scenario: {run.collisions_of_sumo}"
         )
     for name, words in run.fleets.items():
         print(f"{name}: {words}")
