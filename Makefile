@@ -120,7 +120,7 @@ conf: $(VENV)/.ready
 
 # The stamps are made again when what they were made from changes, so a second `make run` installs nothing.
 # What README's commands need comes from plugins/ too: the readers of published recordings, the benchmark, SUMO, traffic.
-EVERYBODYS = plugins/cfx-community plugins/cfx-contracts plugins/cfx-forecasts plugins/cfx-posteriors plugins/cfx-recordings plugins/cfx-report plugins/cfx-rivals plugins/cfx-sumo
+EVERYBODYS = plugins/cfx-community plugins/cfx-contracts plugins/cfx-forecasts plugins/cfx-posteriors plugins/cfx-recordings plugins/cfx-report plugins/cfx-sumo
 $(VENV)/.ready: pyproject.toml $(EVERYBODYS:%=%/pyproject.toml) constraints.txt $(VENV)/.torch
 	$(PIP) install --quiet --constraint constraints.txt $(addprefix --editable ,. $(EVERYBODYS))
 	touch $@

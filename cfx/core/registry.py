@@ -469,7 +469,7 @@ def _installed(
 ) -> tuple[Installed[Any], ...]:
     components = []
     for announced in entries(kind):
-        others = rivals(announced)
+        others = namesakes(announced)
         if others:
             _warn_of_left_out(announced, f"{others[0].distribution} brings one of that name")
             continue
@@ -499,7 +499,7 @@ def is_loaded(announced: Entry) -> bool:
     return announced in _loaded
 
 
-def rivals(announced: Entry) -> tuple[Entry, ...]:
+def namesakes(announced: Entry) -> tuple[Entry, ...]:
     """Returns the entries of other distributions that keep this one from being used.
 
     It is empty for most. Imports nothing.

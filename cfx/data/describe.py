@@ -417,7 +417,7 @@ def _unit_in(name: str, quantity: str) -> str:
 
 def _usable(entry: Entry) -> type[Dataset] | None:
     """Returns a dataset's class; None, and a warning, for a plugin that is broken."""
-    if registry.rivals(entry):
+    if registry.namesakes(entry):
         return None
     try:
         return cast(type[Dataset], registry.get("dataset", entry.name))

@@ -67,7 +67,7 @@ def overview() -> None:
 
 def _state(entry: registry.Entry) -> str:
     """Returns a component's state, as far as it is known without importing the component."""
-    if registry.rivals(entry):
+    if registry.namesakes(entry):
         return "shadowed"
     if registry.other_api(entry):
         return "broken"

@@ -311,7 +311,7 @@ def entries_of(chosen: str | Sequence[str] = ALL_OWN) -> tuple[registry.Entry, .
     """
     usable, own_names = [], set()
     for entry in registry.entries("metric"):
-        if not registry.rivals(entry):
+        if not registry.namesakes(entry):
             usable.append(entry)
             if entry.distribution == OWN:
                 own_names.add(entry.name)

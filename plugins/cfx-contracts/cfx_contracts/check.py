@@ -174,15 +174,15 @@ def _not_tried(entry: registry.Entry, cls: type[Component]) -> str:
 
 def _shadow(entry: registry.Entry) -> str:
     """Returns why another component of that name is used instead; "" if none is."""
-    rivals = registry.rivals(entry)
-    if not rivals:
+    namesakes = registry.namesakes(entry)
+    if not namesakes:
         return ""
-    if rivals[0].distribution == OWN:
+    if namesakes[0].distribution == OWN:
         return (
             f"{entry} is never used, because cfx has a {entry.kind} '{entry.name}' of its own;"
             f" its author must rename it, or pip uninstall {entry.distribution}"
         )
-    others = " and ".join(f"{rival.distribution} {rival.version}" for rival in rivals)
+    others = " and ".join(f"{other.distribution} {other.version}" for other in namesakes)
     return (
         f"{entry} cannot be used, because {others} brings a {entry.kind} of that name too;"
         " uninstall one of them"

@@ -11,8 +11,8 @@ import torch
 from cfx.plugin import PairSet, registry
 from cfx_report.benchmark.contract import CHECKS, Tried, tried
 from cfx_report.benchmark.rival import Rival
-from cfx_rivals.lagged import LaggedRival
-from cfx_rivals.noisy_idm import _given_covariances, _kernel
+from cfx_report.rivals.lagged import LaggedRival
+from cfx_report.rivals.noisy_idm import _given_covariances, _kernel
 
 SMALL: dict[str, dict[str, Any]] = {
     "ridge": {"moments": 200},
@@ -27,7 +27,7 @@ SMALL: dict[str, dict[str, Any]] = {
     "ma_idm": {"remembered": 2, "optimizer": "random"},
     "stacked": {"members": ["ridge", "constant_acceleration"], "similar": 20},
 }
-NAMES = [entry.name for entry in registry.entries("rival") if entry.distribution == "cfx-rivals"]
+NAMES = [entry.name for entry in registry.entries("rival") if entry.distribution == "cfx-report"]
 
 
 def made(name: str, **settings: object) -> Rival:
@@ -67,7 +67,7 @@ def test_noise_is_the_best_linear_prediction() -> None:
 
 def test_sites_are_learned_from_evenly() -> None:
     """A site with many pairs gives no more moments than a small one."""
-    from cfx_rivals.lagged import _drawn
+    from cfx_report.rivals.lagged import _drawn
 
     done = tried(made("constant_speed"))
     pairs = PairSet((*done.pairs.pairs,), "pairs")
@@ -81,5 +81,5 @@ def test_sites_are_learned_from_evenly() -> None:
 def test_a_regression_drives_with_the_lags_that_drive_best(monkeypatch: pytest.MonkeyPatch) -> None:
     rival = made("ridge")
     assert isinstance(rival, LaggedRival)
-    monkeypatch.setattr("cfx_rivals.lagged.mean_error", lambda driver, _: -driver.lags)
+    monkeypatch.setattr("cfx_report.rivals.lagged.mean_error", lambda driver, _: -driver.lags)
     assert tried(rival).driver.lags == 21  # type: ignore[attr-defined]

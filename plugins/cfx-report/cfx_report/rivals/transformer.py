@@ -18,7 +18,7 @@ from torch import Tensor, nn
 
 from cfx.plugin import Settings
 from cfx_report.benchmark.rival import Seen
-from cfx_rivals.rollout_training import (
+from cfx_report.rivals.rollout_training import (
     FEATURES,
     NetworkDriver,
     RolloutRival,

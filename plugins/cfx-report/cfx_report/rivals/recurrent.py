@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from cfx_report.benchmark.rival import Seen
-from cfx_rivals.rollout_training import (
+from cfx_report.rivals.rollout_training import (
     FEATURES,
     NetworkDriver,
     RolloutRival,

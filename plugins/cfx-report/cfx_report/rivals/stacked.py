@@ -29,7 +29,7 @@ from cfx.errors import ConfigError
 from cfx.plugin import PairBatch, PairSet, Settings, registry
 from cfx_report.benchmark.rival import Driver, Rival
 from cfx_report.benchmark.segments import Segments, moments
-from cfx_rivals.lagged import HORIZONS_S, between_horizons, divided, mean_error
+from cfx_report.rivals.lagged import HORIZONS_S, between_horizons, divided, mean_error
 
 Floats = NDArray[np.float64]
 
