@@ -11,7 +11,7 @@ from cfx.models.krauss import Krauss
 from cfx.policies.agent import Agent
 from cfx_community.policies.estimator import EstimatorPolicy
 
-pytest.importorskip("traci", reason="needs the extra sumo")
+pytest.importorskip("cfx_sumo", reason="its live driver drives here")
 
 from cfx_sumo.live.driver import Driver
 from tests.road import Car, Road

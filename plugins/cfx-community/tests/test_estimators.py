@@ -36,7 +36,6 @@ from cfx_community.policies.particle_filter import ParticleFilterPolicy, reweigh
 from cfx_community.policies.recalibrate import RecalibratePolicy
 from cfx_community.policies.ukf import UkfPolicy, unscented_update
 from cfx_contracts import check_contract
-from cfx_sumo.vtype import SumoVType
 from tests.drives import simulate_from_origins, wavy_pairs
 
 WINDOWS = WindowSettings()
@@ -281,7 +280,8 @@ def test_with_a_residual_a_forecast_starts_with_the_drivers_acceleration(residua
 
 
 def test_a_model_without_equations_is_refused() -> None:
-    model = SumoVType(
+    vtype = pytest.importorskip("cfx_sumo.vtype", reason="SUMO alone knows EIDM's equations")
+    model = vtype.SumoVType(
         car_follow_model="EIDM", parameters={"tau": {"low": 0.5, "high": 3, "default": 1}}
     )
     with pytest.raises(ConfigError, match="equations in"):

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from cfx_report import inline
-
 
 @pytest.fixture
 def blank_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Makes the pages of a test quick, which are looked at for something else than figures."""
+    from cfx_report import inline
+
     monkeypatch.setattr(inline, "inline_svg", lambda _: '<svg viewBox="0 0 1 1"></svg>')

@@ -8,6 +8,9 @@ from pathlib import Path
 import pytest
 
 from cfx_forecasts.errors import forecast_methods, forecast_metrics
+
+pytest.importorskip("cfx_report", reason="the page is that of cfx-report")
+
 from cfx_forecasts.sections import crps_sheet, errors
 from cfx_report.page import render
 from cfx_report.runs import read_runs

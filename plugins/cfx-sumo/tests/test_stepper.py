@@ -15,11 +15,11 @@ from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.plugin import DrivingModel, Follower, Leader, Start
 from cfx.simulation.rollout import MemoryStepper
-from cfx_community.models.w74 import W74
 from cfx_contracts import check_contract
 from cfx_sumo.simulation.simulator import SumoSimulator
 from cfx_sumo.simulation.stepper import require_in_sumo
 from cfx_sumo.vtype import SumoVType
+from tests.evaluation.test_platoon import Linear
 
 pytestmark = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,
@@ -288,9 +288,9 @@ def test_nobody_or_no_time_is_no_drive(eidm: object, case: Case) -> None:
     ("model", "dt", "sentence"),
     [
         (
-            W74(),
+            Linear(),
             DT,
-            "SUMO has no car-following model W74; choose model=krauss_sumo, idm_sumo, w99, krauss"
+            "SUMO has no car-following model Linear; choose model=krauss_sumo, idm_sumo, w99, krauss"
             " or sumo_vtype",
         ),
         (Krauss(), DT, "only without a brake build-up time; add model.variant=sumo"),

@@ -21,12 +21,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.models.base import DrivingModel, Follower, Leader, bumper_gap
+from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.vtype import InSumo, VType
 from cfx.models.w99 import W99
 from cfx.simulation.rollout import simulate_follower
 from cfx.simulation.trajectory import Start, Trajectory
-from cfx_community.models.w74 import W74
 from cfx_sumo.idm import IdmSumo
 from cfx_sumo.krauss import KraussSumo
 from tests.forks import Forks
@@ -157,12 +157,8 @@ def sumos_krauss(rng: np.random.Generator, count: int) -> list[Values]:
     return [row | {"emergencyDecel": max(row["emergencyDecel"], row["decel"])} for row in rows]
 
 
-def plugins_idm() -> Twin | None:
-    """The plugin's `idm`: no brake cap (lifted in SUMO here), and other gaps below 0.1 m."""
-    if importlib.util.find_spec("cfx_community") is None:
-        return None
-    from cfx.models.idm import IDM
-
+def published_idm() -> Twin:
+    """Returns `idm`: no brake cap (lifted in SUMO here), and other gaps below 0.1 m."""
     names = {
         "v0": "maxSpeed",
         "T": "tau",
@@ -182,20 +178,17 @@ def plugins_idm() -> Twin | None:
     def same(follower: Follower, leader: Leader, p: Mapping[str, Tensor]) -> Tensor:
         return bumper_gap(follower, leader) >= 0.1
 
-    return Twin(
-        "idm (cfx-community) / IDM", IDM(limits=None), anywhere(IDM()), same=same, vtype=vtype
-    )
+    return Twin("idm / IDM", IDM(limits=None), anywhere(IDM()), same=same, vtype=vtype)
 
 
-PLUGINS_IDM = plugins_idm()
 KRAUSS = Krauss(limits=None, variant="sumo", parameters={"t_i": {"default": 0.0, "tuned": False}})
 TWINS = [
     Twin("krauss, t_i = 0 / KraussOrig1", KRAUSS, krauss_parameters, same=krauss_radicand),
     Twin("krauss_sumo / Krauss", KraussSumo(limits=None), sumos_krauss),
     Twin("idm_sumo / IDM", IdmSumo(limits=None), anywhere(IdmSumo())),
     Twin("w99 / W99", W99(limits=None), anywhere(W99(), b=4.5, b_max=9.0, v_max=55.0), draws=True),
-    *([PLUGINS_IDM] if PLUGINS_IDM is not None else []),
-]  # fmt: skip
+    published_idm(),
+]
 every_twin = pytest.mark.parametrize("twin", TWINS, ids=[twin.name for twin in TWINS])
 
 
@@ -464,6 +457,7 @@ def wiedemanns_case(follower: Follower, leader: Leader, p: Mapping[str, Tensor])
 
 
 def test_w74_takes_the_steps_of_sumos_wiedemann_where_both_follow_or_approach() -> None:
+    w74 = pytest.importorskip("cfx_community.models.w74", reason="the model is cfx-community's")
     rng = np.random.default_rng(6)
     cases = []
     for _ in range(800):
@@ -493,7 +487,7 @@ def test_w74_takes_the_steps_of_sumos_wiedemann_where_both_follow_or_approach() 
         cases.append(Drive(np.array([v_l, v_l]), 0.0, 5.0, gap, v, 0.5, p))
     twin = Twin(
         "w74 / Wiedemann, two cases",
-        W74(limits=None),
+        w74.W74(limits=None),
         lambda *_: [],
         same=wiedemanns_case,
         vtype=sumos_wiedemann,

@@ -21,8 +21,6 @@ from cfx.models.base import DrivingModel
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
-from cfx_community.models.optimal_velocity import optimal_velocity
-from cfx_community.models.ovm import OVM
 from cfx_forecasts.traffic.edie import region
 from cfx_forecasts.traffic.measure import Settled
 from tests.evaluation.test_closed_loop import adaptive, constant
@@ -75,6 +73,10 @@ def test_the_optimal_velocity_model_is_unstable_where_theory_says_so(
     share: float, *, grows: bool
 ) -> None:
     """Bando et al. (1995): unstable where V'(s) > 1 / (2 tau)."""
+    pytest.importorskip("cfx_community", reason="the model is cfx-community's")
+    from cfx_community.models.optimal_velocity import optimal_velocity
+    from cfx_community.models.ovm import OVM
+
     model = OVM()
     p = model.space.unpack(model.space.defaults())
     gap = torch.tensor(1000.0 / 45.0 - LENGTH).double().requires_grad_()

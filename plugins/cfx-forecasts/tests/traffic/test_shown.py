@@ -15,9 +15,12 @@ from cfx.figures.drawing import draw_figure, figure_named
 from cfx.figures.wording import MINUS, method_label
 from cfx.results.result import Result
 from cfx_forecasts.traffic.figures import draw_paths, draw_traffic, path_panels, traffic_panels
-from cfx_forecasts.traffic.section import traffic_sheet
 from cfx_forecasts.traffic.summary import traffic_methods, traffic_metrics
 from cfx_forecasts.traffic.tables import ROAD_COLUMNS
+
+pytest.importorskip("cfx_report", reason="the page is that of cfx-report")
+
+from cfx_forecasts.traffic.section import traffic_sheet
 from cfx_report.page import render
 from cfx_report.runs import read_runs
 from tests.drawn import drawn_lines
