@@ -87,6 +87,7 @@ def test_check_names_the_extra_that_is_not_installed(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What lacks an extra is not broken."""
+    pytest.importorskip("cfx_dask", reason="its engine needs a package that may be missing")
     found = importlib.util.find_spec
     without = {"distributed": None}
     monkeypatch.setattr(
@@ -129,7 +130,10 @@ def test_check_runs_the_contract_and_hints_at_what_could_be_better(
 
 @pytest.mark.parametrize("kind", ["figure", "head", "export", "posterior", "tracker"])
 def test_a_kind_without_a_contract_is_loaded_and_said_to_have_none(kind: str, capsys) -> None:
-    name = registry.names(kind)[0]
+    names = registry.names(kind)
+    if not names:
+        pytest.skip(f"no {kind} is installed")
+    name = names[0]
     assert cli.main(["plugins", "check", kind, name]) == 0
     printed = capsys.readouterr()
     assert re.search(rf"^ *{kind} +{name} .* fine *$", printed.out, re.MULTILINE)
