@@ -5,8 +5,9 @@
 Cosmic Ray makes the mutants: another operator, comparison or number, a branch or a decorator left
 out. They are drawn by a seed, the place first and then the change, so that places with many possible
 changes do not outweigh others. What changes annotations alone is left out. Each mutant is a change
-of a copy of the checkout in `.mutants`, and runs against the tests of its room there: the
-first failure kills it, as does a run of more than three times as long as without a change.
+of a copy of the checkout in `.mutants`, and runs against the tests of its room there, those that
+import its module first: the first failure kills it, as does a run of more than three times as long
+as without a change.
 
 Verdicts are kept in `.mutants/verdicts.jsonl`, by the content of what was changed: a run that
 was interrupted goes on, and a mutant of a file that has changed since is tried again. The table of
@@ -155,8 +156,18 @@ def copy_checkout() -> None:
             shutil.copyfile(source, target)
 
 
-def fails(room: str, timeout_s: float | None) -> bool | None:
-    """Runs the tests of a room; says whether they fail, None where they take too long."""
+def tests_of(mutant: Mutant) -> list[str]:
+    """Returns what pytest runs: files of the room that import the module first, then the room."""
+    dotted = mutant.module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
+    first = []
+    for file in sorted((TREE / "tests" / mutant.room).rglob("test_*.py")):
+        if dotted in file.read_text(encoding="utf-8"):
+            first.append(file.relative_to(TREE).as_posix())
+    return [*first, f"tests/{mutant.room}"]
+
+
+def fails(tests: Sequence[str], timeout_s: float | None) -> bool | None:
+    """Runs tests of the copy; says whether they fail, None where they take too long."""
     environment = {
         **os.environ,
         "PYTHONPATH": str(TREE),
@@ -164,7 +175,7 @@ def fails(room: str, timeout_s: float | None) -> bool | None:
         "CFX_KERNEL_CACHE": str(FOLDER / "kernels"),
     }
     (FOLDER / "kernels").mkdir(mode=0o700, exist_ok=True)
-    command = [sys.executable, "-m", "pytest", *TESTS, f"tests/{room}"]
+    command = [sys.executable, "-m", "pytest", *TESTS, *tests]
     try:
         done = subprocess.run(
             command,
@@ -185,10 +196,11 @@ def seconds_without_change(room: str) -> float:
     Raises:
         SystemExit: they fail.
     """
-    if fails(room, None):
+    tests = [f"tests/{room}"]
+    if fails(tests, None):
         sys.exit(f"tests/{room} fails in a copy without a change: {TREE}")
     began = time.monotonic()
-    fails(room, None)
+    fails(tests, None)
     return time.monotonic() - began
 
 
@@ -200,7 +212,7 @@ def judged(mutant: Mutant, timeout_s: float) -> Verdict:
     path.write_text(changed, encoding="utf-8")
     try:
         outcome = {True: "killed", False: "survived", None: "timeout"}
-        verdict = outcome[fails(mutant.room, timeout_s)]
+        verdict = outcome[fails(tests_of(mutant), timeout_s)]
     finally:
         path.write_text(source, encoding="utf-8")
     before, after = _first_difference(source.splitlines(), changed.splitlines())

@@ -59,3 +59,15 @@ def test_survivors_stand_in_the_table() -> None:
     assert "| models | 2 | 1 |" in text
     assert "| cfx/models/w99.py:7 | `x \\| y` | `x & y` |" in text
     assert "idm.py" not in text
+
+
+def test_tests_that_import_the_module_run_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mutants, "TREE", tmp_path)
+    folder = tmp_path / "tests" / "models"
+    folder.mkdir(parents=True)
+    (folder / "test_all.py").write_text("import cfx\n")
+    (folder / "test_one.py").write_text("from cfx.models.idm import IDM\n")
+    mutant = Mutant("cfx/models/idm.py", "", 0, 1)
+    assert mutants.tests_of(mutant) == ["tests/models/test_one.py", "tests/models"]
