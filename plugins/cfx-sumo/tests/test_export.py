@@ -312,14 +312,18 @@ def test_vtypes_have_in_plain_sumo_the_error_that_the_job_says(
         assert np.sqrt(np.mean(difference**2)) == pytest.approx(error, rel=0.01)
 
 
-def test_what_cannot_be_exported_is_one_sentence(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_model_that_sumo_lacks_is_not_exported(tmp_path: Path) -> None:
+    pytest.importorskip("cfx_community", reason="the model is cfx-community's")
     with pytest.raises(
         ConfigError,
         match="SUMO has no car-following model that drives as model=w74; export jobs with model=",
     ):
         export(job(tmp_path / "w74", {"name": "w74"}))
+
+
+def test_what_cannot_be_exported_is_one_sentence(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     with pytest.raises(ConfigError, match="variant=sumo only"):
         export(job(tmp_path / "vissim", {"name": "w99", "variant": "vissim"}))
     assert main(["export", str(tmp_path), "--to", "sumo"]) == 2

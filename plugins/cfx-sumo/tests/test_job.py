@@ -27,6 +27,9 @@ needs_sumo = pytest.mark.skipif(
     importlib.util.find_spec("libsumo") is None,
     reason="SUMO is not here; pip install 'cfx-driving[sumo]'",
 )
+needs_community = pytest.mark.skipif(
+    importlib.util.find_spec("cfx_community") is None, reason="the model is cfx-community's"
+)
 
 QUICK = [
     "model=krauss",
@@ -152,7 +155,9 @@ def test_a_policy_that_learned_drives_w99_in_sumo(tmp_path: Path) -> None:
             "add simulator=sumo",
         ),
         pytest.param(
-            ["model=w74", "simulator=sumo"], "SUMO has no car-following model W74", marks=needs_sumo
+            ["model=w74", "simulator=sumo"],
+            "SUMO has no car-following model W74",
+            marks=[needs_sumo, needs_community],
         ),
         (
             ["simulator=sumo", "simulator.workers=0"],

@@ -120,6 +120,7 @@ def test_a_stochastic_policy_drives_at_its_centre_and_sampled(
     ["policy=recalibrate", "policy=ukf", "policy=particle_filter policy.particles=20"],
 )
 def test_estimators_drive_too(policy: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    pytest.importorskip("cfx_community", reason="the estimators are cfx-community's")
     monkeypatch.chdir(tmp_path)
     short = ["protocol.duration=12", "protocol.settle=1", "model=idm", "protocol.noise=[2,0.2]"]
     short += ["protocol.densities=[60]", "protocol.repetitions=1", "calibration.prior=none"]
