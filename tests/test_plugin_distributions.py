@@ -193,6 +193,51 @@ def test_it_uses_the_doors_alone(plugin: Path) -> None:
     assert not wrong, "\n".join(wrong)
 
 
+def needed_by(name: str) -> set[str]:
+    """Returns a distribution and those of cfx that it depends on, and what is in every test."""
+    needed = {name, "cfx-contracts"}
+    for requirement in project(ROOT / "plugins" / name)["dependencies"]:
+        other = re.match(r"[\w-]+", requirement)[0]
+        if other.startswith("cfx-") and other != "cfx-driving":
+            needed |= needed_by(other)
+    return needed
+
+
+def imported_unasked(path: Path, needed: set[str]) -> list[str]:
+    """Returns what a test file imports of other distributions before `importorskip` asks for it."""
+    asked, wrong = {name.replace("-", "_") for name in needed}, []
+    for statement in ast.parse(path.read_text(encoding="utf-8")).body:
+        modules = []
+        if isinstance(statement, ast.Import):
+            modules = [alias.name for alias in statement.names]
+        elif isinstance(statement, ast.ImportFrom) and statement.level == 0:
+            modules = [str(statement.module)]
+        elif "importorskip" in ast.dump(statement):
+            asked |= set(re.findall(r"\bcfx_\w+", ast.unparse(statement)))
+        for module in modules:
+            package = module.partition(".")[0]
+            if package.startswith("cfx_") and package not in asked:
+                wrong.append(f"{path}:{statement.lineno}: {module}")
+    return wrong
+
+
+@pytest.mark.parametrize("plugin", PLUGINS, ids=lambda path: path.name)
+def test_its_tests_import_beside_the_core_alone(plugin: Path) -> None:
+    """`make beside` runs them there."""
+    needed, wrong = needed_by(plugin.name), []
+    for path in sorted((plugin / "tests").rglob("*.py")):
+        wrong += imported_unasked(path, needed)
+    assert not wrong, "\n".join(wrong)
+
+
+def test_an_import_of_another_distribution_has_to_be_asked_for(tmp_path: Path) -> None:
+    path = tmp_path / "test_it.py"
+    path.write_text("from cfx_sumo import x\n")
+    assert imported_unasked(path, {"cfx-report"}) == [f"{path}:1: cfx_sumo"]
+    path.write_text('import pytest\npytest.importorskip("cfx_sumo")\nfrom cfx_sumo import x\n')
+    assert not imported_unasked(path, {"cfx-report"})
+
+
 def test_templates_examples_and_documents_use_the_doors_alone(tmp_path: Path) -> None:
     wrong = []
     templates = ROOT / "plugins" / "cfx-contracts" / "cfx_contracts" / "template"
