@@ -92,6 +92,7 @@ def test_a_population_as_the_prior_leaves_less_doubt() -> None:
 
 
 def test_chains_of_another_simulator_are_refused() -> None:
-    pytest.importorskip("libsumo")
+    pytest.importorskip("libsumo", reason="SUMO is not here")
+    pytest.importorskip("cfx_sumo", reason="the other simulator is that of cfx-sumo")
     with pytest.raises(ConfigError, match="simulator=memory alone"):
         cfx.run([*QUICK, "model=krauss_sumo", "simulator=sumo", "calibration.posterior=nuts"])

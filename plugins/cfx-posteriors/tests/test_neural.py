@@ -100,6 +100,7 @@ def test_without_sbi_it_says_what_installs_it(monkeypatch: pytest.MonkeyPatch) -
 def test_sumo_in_the_loop(way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The posterior of a model that SUMO drives is that of its equations."""
     pytest.importorskip("libsumo", reason="SUMO is not here; pip install 'cfx-driving[sumo]'")
+    pytest.importorskip("cfx_sumo", reason="its simulator drives them too")
     monkeypatch.chdir(tmp_path)
     for setting, value in {"FIRST": 100, "ROUNDS": 1, "EPOCHS": 1, "SIMULATIONS": 1}.items():
         monkeypatch.setattr(neural, setting, value)
