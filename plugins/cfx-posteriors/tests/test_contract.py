@@ -28,14 +28,14 @@ def drawn() -> Drawn:
     return draw_recordings(Krauss(), len(IDS), frames=FRAMES)
 
 
-def found_by(name: str, drawn: Drawn) -> ParameterIntervals:
+def posteriors_by(name: str, drawn: Drawn) -> ParameterIntervals:
     solver = Solver(MemoryStepper(Krauss(), DT), RandomSearch(), seed=3)
     best = Krauss().space.defaults(dtype=torch.float64).expand(len(IDS), -1)
     last = torch.full((len(IDS),), FRAMES - 1)
     settings = CalibrationSettings(posterior=name)
-    found = posterior_method(name).find(solver, drawn.batch, last, best, settings)
-    assert isinstance(found, ParameterIntervals)
-    return found
+    posteriors = posterior_method(name).find(solver, drawn.batch, last, best, settings)
+    assert isinstance(posteriors, ParameterIntervals)
+    return posteriors
 
 
 SLOW = {"nuts", "sbi"}
@@ -62,14 +62,14 @@ def test_contract(name: str, drawn: Drawn, monkeypatch: pytest.MonkeyPatch, tmp_
             monkeypatch.setattr(nuts, setting, value)
     monkeypatch.chdir(tmp_path)
     before = torch.get_rng_state(), torch.get_default_dtype(), np.random.get_state()[1].tolist()  # noqa: NPY002 - others' random numbers
-    found = found_by(name, drawn)
-    again = found_by(name, drawn)
+    posteriors = posteriors_by(name, drawn)
+    again = posteriors_by(name, drawn)
     after = torch.get_rng_state(), torch.get_default_dtype(), np.random.get_state()[1].tolist()  # noqa: NPY002 - as above
     torch.testing.assert_close(after[0], before[0])
     assert after[1:] == before[1:]
     assert not list(tmp_path.iterdir())
 
-    columns = found.columns()
+    columns = posteriors.columns()
     for parameter in Krauss().space.names:
         low, middle, high = (columns[f"{kind}_{parameter}"] for kind in ("low", "median", "high"))
         assert (low < middle).all()
@@ -78,10 +78,10 @@ def test_contract(name: str, drawn: Drawn, monkeypatch: pytest.MonkeyPatch, tmp_
     for kind in ("noise_scale", "noise_correlation", "noise_left", "effective_samples"):
         assert np.isfinite(columns[kind]).all()
     assert {"pareto_k", "r_hat"} & columns.keys()
-    torch.testing.assert_close(found.draws, again.draws, rtol=0, atol=0)
-    tables = found.tables(IDS)
+    torch.testing.assert_close(posteriors.draws, again.draws, rtol=0, atol=0)
+    tables = posteriors.tables(IDS)
     assert set(tables["posterior"]["pair_id"]) == set(tables["fan"]["pair_id"]) == set(IDS)
     new = tables["population" if posterior_method(name).has_population else "prior"]
     low, high = Krauss().space.bounds()
-    for values in (found.draws, torch.tensor(new.to_numpy())):
+    for values in (posteriors.draws, torch.tensor(new.to_numpy())):
         assert bool(((values >= low) & (values <= high)).all())

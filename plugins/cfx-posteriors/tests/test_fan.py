@@ -22,15 +22,15 @@ def test_with_true_parameters_a_forecast_holds_nine_in_ten(
     drawn = draw_recordings(Krauss(), 150, signal=signal, seed=2)
     true = drawn.truth[:, None].expand(-1, 100, -1)
     frame = torch.full((150,), 305)
-    found = fan_of(drawn.posterior, frame, true, SHARES, seed=0, memory=1 << 30)
+    fan = fan_of(drawn.posterior, frame, true, SHARES, seed=0, memory=1 << 30)
     two = torch.tensor([0, 7])
     alone = fan_of(drawn.posterior.take(two), frame[two], true[two], SHARES, seed=0, memory=1)
-    torch.testing.assert_close(found.quantiles[two], alone.quantiles)
-    check = found.check(seed=0)
+    torch.testing.assert_close(fan.quantiles[two], alone.quantiles)
+    check = fan.check(seed=0)
     assert float(check["held"].mean()) == pytest.approx(0.9, abs=0.05)
     assert float((check["held_chance"] < 0.05).double().mean()) < 0.12
-    assert found.time[:2].tolist() == [1.0, 2.0]
-    table = found.table([f"p{number}" for number in range(150)])
+    assert fan.time[:2].tolist() == [1.0, 2.0]
+    table = fan.table([f"p{number}" for number in range(150)])
     assert table["calibrated_on"].sum() == 150 * 30
     simulated = table[table["calibrated_on"]]
     assert (simulated["low"] == simulated["high"]).all(), "one trajectory, without noise"

@@ -26,10 +26,10 @@ def sampled(drawn: Drawn, *, memory: int = 1 << 30) -> Sampled:
     return sample(drawn.posterior, normal, SHARES, seed=0, memory=memory)
 
 
-def ranks_of(drawn: Drawn, found: Sampled) -> Tensor:
+def ranks_of(drawn: Drawn, samples: Sampled) -> Tensor:
     """Returns the ranks of true parameters among 20 classes that are equally likely."""
     truth = drawn.truth[:, None, : len(drawn.posterior.space)]
-    return (truth > found.quantiles).sum(1)
+    return (truth > samples.quantiles).sum(1)
 
 
 def held(ranks: Tensor) -> float:
@@ -44,9 +44,9 @@ def test_intervals_hold_the_truth_about_as_often_as_they_say(
     model: DrivingModel, signal: Literal["speed", "gap"], drivers: int
 ) -> None:
     drawn = draw_recordings(model, drivers, signal=signal)
-    found = sampled(drawn)
-    assert float(found.reliable.double().mean()) > 0.95
-    assert 0.84 < held(ranks_of(drawn, found)) < 0.95
+    samples = sampled(drawn)
+    assert float(samples.reliable.double().mean()) > 0.95
+    assert 0.84 < held(ranks_of(drawn, samples)) < 0.95
 
 
 def test_ranks_of_true_parameters_are_uniform() -> None:
@@ -62,12 +62,12 @@ def test_ranks_of_true_parameters_are_uniform() -> None:
 def test_where_samples_do_not_settle_it_is_said_and_tempered_ones_hold_the_truth() -> None:
     """W99's density jumps."""
     drawn = draw_recordings(W99(), 24, frames=300)
-    found = sampled(drawn)
-    assert 0.0 < float(found.reliable.double().mean()) < 0.95
-    ranks = ranks_of(drawn, found)
-    assert held(ranks[found.reliable]) > 0.8
-    assert held(ranks[~found.reliable]) > 0.75
-    assert float(found.effective[~found.reliable].median()) < 100
+    samples = sampled(drawn)
+    assert 0.0 < float(samples.reliable.double().mean()) < 0.95
+    ranks = ranks_of(drawn, samples)
+    assert held(ranks[samples.reliable]) > 0.8
+    assert held(ranks[~samples.reliable]) > 0.75
+    assert float(samples.effective[~samples.reliable].median()) < 100
 
 
 def test_tempered_samples_are_the_posterior() -> None:
@@ -75,20 +75,20 @@ def test_tempered_samples_are_the_posterior() -> None:
     drawn = draw_recordings(Krauss(), 12, frames=300)
     weighted, n = sampled(drawn), len(drawn.posterior.space)
     places = tempered(drawn.posterior, seed=0)
-    found = places[..., :n].quantile(SHARES, dim=1).transpose(0, 1)
-    middle = found[:, 9] - weighted.quantiles[:, 9]
+    quantiles = places[..., :n].quantile(SHARES, dim=1).transpose(0, 1)
+    middle = quantiles[:, 9] - weighted.quantiles[:, 9]
     width = weighted.quantiles[:, -1] - weighted.quantiles[:, 0]
     assert float((middle / width).abs().max()) < 0.15
-    torch.testing.assert_close(found[:, -1] - found[:, 0], width, rtol=0.25, atol=0)
+    torch.testing.assert_close(quantiles[:, -1] - quantiles[:, 0], width, rtol=0.25, atol=0)
     alone = tempered(drawn.posterior.take(torch.tensor([3])), seed=0)
     torch.testing.assert_close(alone[0], places[3], rtol=1e-6, atol=1e-6)
 
 
 def test_draws_are_as_likely_as_the_quantiles_say() -> None:
     drawn = draw_recordings(IDM(), 20, frames=300)
-    found = sampled(drawn)
-    assert found.draws.shape == (20, DRAWS, 7)
-    below = (found.draws[:, :, None, :5] < found.quantiles[:, None]).double().mean(1)
+    samples = sampled(drawn)
+    assert samples.draws.shape == (20, DRAWS, 7)
+    below = (samples.draws[:, :, None, :5] < samples.quantiles[:, None]).double().mean(1)
     wanted = SHARES[:, None].expand(19, 5)
     torch.testing.assert_close(below.mean(0), wanted, atol=0.02, rtol=0)
     torch.testing.assert_close(below, wanted.expand(20, 19, 5), atol=0.12, rtol=0)
@@ -108,18 +108,18 @@ def test_drivers_with_random_numbers_of_their_own_agree_within_errors() -> None:
     ends = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
     shared = sample(same, normal, ends, seed=0, memory=1 << 30)
     torch.testing.assert_close(shared.draws[0], shared.draws[1])
-    found = sample(same, normal, ends, seed=0, memory=1 << 30, draws=50, apart=True)
-    assert found.draws.shape[1] == 50
-    assert float((found.draws[0] - found.draws[1]).abs().mean()) > 0.01
+    samples = sample(same, normal, ends, seed=0, memory=1 << 30, draws=50, apart=True)
+    assert samples.draws.shape[1] == 50
+    assert float((samples.draws[0] - samples.draws[1]).abs().mean()) > 0.01
     width = shared.quantiles[:1, 2] - shared.quantiles[:1, 0]
-    assert float(((found.quantiles - shared.quantiles) / width[:, None]).abs().max()) < 0.15
+    assert float(((samples.quantiles - shared.quantiles) / width[:, None]).abs().max()) < 0.15
     cut = sample(same, normal, ends, seed=0, memory=1, draws=50, apart=True)
-    torch.testing.assert_close(cut.draws, found.draws, rtol=1e-6, atol=1e-6)
+    torch.testing.assert_close(cut.draws, samples.draws, rtol=1e-6, atol=1e-6)
 
 
 def test_a_longer_recording_leaves_less_doubt() -> None:
     widths = []
     for frames in (150, 1200):
-        found = sampled(draw_recordings(Krauss(), 20, frames=frames))
-        widths.append(float((found.quantiles[:, -1] - found.quantiles[:, 0]).median()))
+        samples = sampled(draw_recordings(Krauss(), 20, frames=frames))
+        widths.append(float((samples.quantiles[:, -1] - samples.quantiles[:, 0]).median()))
     assert widths[1] < 0.6 * widths[0]

@@ -61,7 +61,7 @@ def test_the_density_of_noise_is_that_of_its_innovations() -> None:
     squashed = torch.tensor([[0.8, -0.3], [0.1, 0.4]], dtype=torch.float64)
     log_scale = torch.tensor([[-0.2], [0.3]], dtype=torch.float64)
     products = noise.lagged_products(errors, counted, 2)
-    found = noise.log_density(products, counted.sum(0), torch.cat([squashed, log_scale], dim=1))
+    density = noise.log_density(products, counted.sum(0), torch.cat([squashed, log_scale], dim=1))
     partial = squashed.tanh()
     for column, count in ((0, 40), (1, 30)):
         first, second = partial[column].tolist()
@@ -73,7 +73,7 @@ def test_the_density_of_noise_is_that_of_its_innovations() -> None:
         for t in range(2, count + 2):
             innovation = own[t] - phi[0] * own[t - 1] - phi[1] * own[t - 2]
             wanted += -math.log(scale) - 0.5 * (innovation / scale) ** 2
-        assert float(found[column]) == pytest.approx(wanted, rel=1e-12)
+        assert float(density[column]) == pytest.approx(wanted, rel=1e-12)
 
 
 def test_without_a_prior_parameters_are_uniform_between_their_bounds() -> None:

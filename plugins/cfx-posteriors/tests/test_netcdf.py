@@ -23,8 +23,8 @@ from cfx_posteriors.netcdf import NetcdfExport
 def test_a_jobs_posterior_is_labelled_arrays(method: str, others: str, tmp_path: Path) -> None:
     quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures=none"]
     job = [f"hydra.run.dir={tmp_path}/job", "tracking.enabled=false"]
-    found = cfx.run([*quick, *job, f"calibration.posterior={method}"])
-    said = NetcdfExport().write(str(found.folder), None)
+    result = cfx.run([*quick, *job, f"calibration.posterior={method}"])
+    said = NetcdfExport().write(str(result.folder), None)
     assert "200 draws for each of 4 pairs" in said[0]
     tree = xr.open_datatree(tmp_path / "job" / "posterior.nc", engine="h5netcdf")
     assert arviz_base.extract(tree).sizes == {"sample": 200, "pair": 4}
@@ -43,8 +43,8 @@ def test_chains_are_a_dimension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(nuts, "DRAWS", 50)
     quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures=none"]
     job = [f"hydra.run.dir={tmp_path}/job", "tracking.enabled=false"]
-    found = cfx.run([*quick, *job, "calibration.posterior=nuts"])
-    NetcdfExport().write(str(found.folder), None)
+    result = cfx.run([*quick, *job, "calibration.posterior=nuts"])
+    NetcdfExport().write(str(result.folder), None)
     tree = xr.open_datatree(tmp_path / "job" / "posterior.nc", engine="h5netcdf")
     assert tree["posterior"].sizes == {"chain": nuts.CHAINS, "draw": 50, "pair": 4}
     draws = pd.read_parquet(tmp_path / "job" / "posterior.parquet")

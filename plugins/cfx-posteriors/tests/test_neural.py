@@ -31,15 +31,15 @@ SHARES = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
 @pytest.mark.slow
 def test_samples_are_the_posterior() -> None:
     posterior = draw_recordings(Krauss(), 2, frames=300).posterior
-    found = neural.learn(posterior, SHARES, seed=0, memory=1 << 30)
-    assert float(found.pareto_k.max()) < 0.7
-    assert 0.8 < float(found.coverage[0]) < 0.97
+    learned = neural.learn(posterior, SHARES, seed=0, memory=1 << 30)
+    assert float(learned.pareto_k.max()) < 0.7
+    assert 0.8 < float(learned.coverage[0]) < 0.97
     normal = laplace(posterior, likely_starts(posterior, 0))
     weighted = sample(posterior, normal, SHARES, seed=0, memory=1 << 30)
     width = weighted.quantiles[:, 2:] - weighted.quantiles[:, :1]
-    apart = (found.quantiles - weighted.quantiles) / width
+    apart = (learned.quantiles - weighted.quantiles) / width
     assert float(apart.abs().max()) < 0.15
-    assert float((posterior(found.likeliest[:, None])[:, 0] - normal.log_density).min()) > -0.5
+    assert float((posterior(learned.likeliest[:, None])[:, 0] - normal.log_density).min()) > -0.5
 
 
 def test_a_round_knows_the_density_of_what_it_draws(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,11 +65,11 @@ def test_recordings_do_not_depend_on_how_many_are_simulated_at_once() -> None:
     parts = []
     for drivers in ([[0, 1, 2]], [[0], [1, 2]]):
         generator = torch.Generator().manual_seed(0)
-        found = []
+        recordings = []
         for some in map(torch.tensor, drivers):
             cut = neural._Region(*(values[some] for values in region))
-            found.append(neural._recordings(posterior.take(some), cut, 20, generator))
-        parts.append([torch.cat(values) for values in zip(*found, strict=True)])
+            recordings.append(neural._recordings(posterior.take(some), cut, 20, generator))
+        parts.append([torch.cat(values) for values in zip(*recordings, strict=True)])
     for one, other in zip(*parts, strict=True):
         torch.testing.assert_close(one, other, rtol=1e-6, atol=1e-6)
 
@@ -105,10 +105,10 @@ def test_sumo_in_the_loop(way: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     for setting, value in {"FIRST": 100, "ROUNDS": 1, "EPOCHS": 1, "SIMULATIONS": 1}.items():
         monkeypatch.setattr(neural, setting, value)
     asked = [*QUICK, "model=krauss_sumo", "data.pairs=1", f"calibration.posterior={way}"]
-    found = {}
+    fits_of = {}
     for simulator in ("sumo", "memory"):
         cfx.run([*asked, f"simulator={simulator}", f"hydra.run.dir={simulator}"])
         fits = pd.read_parquet(f"{simulator}/fits.parquet")
-        found[simulator] = fits[fits["method"] == "driver_specific"].set_index("pair_id")
+        fits_of[simulator] = fits[fits["method"] == "driver_specific"].set_index("pair_id")
     medians = [f"median_{name}" for name in ("tau", "accel", "decel", "minGap")]
-    pd.testing.assert_frame_equal(found["sumo"][medians], found["memory"][medians], rtol=0.1)
+    pd.testing.assert_frame_equal(fits_of["sumo"][medians], fits_of["memory"][medians], rtol=0.1)

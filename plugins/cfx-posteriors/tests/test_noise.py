@@ -38,9 +38,9 @@ def test_the_noise_that_drivers_were_simulated_with_is_the_most_evident(noise: s
     solver, batch = simulated(noise)
     best = IDM().space.defaults().double().expand(len(batch), -1)
     settings = CalibrationSettings(posterior="laplace")
-    found = choose_noise(solver, batch, batch.lengths - 1, best, settings)
-    assert found.name == noise
-    table = found.table([str(number) for number in range(len(batch))])
+    chosen = choose_noise(solver, batch, batch.lengths - 1, best, settings)
+    assert chosen.name == noise
+    table = chosen.table([str(number) for number in range(len(batch))])
     assert len(table) == len(NOISE_KINDS) * len(batch)
     assert table.loc[table["chosen"], "noise"].unique().tolist() == [noise]
 
@@ -79,9 +79,9 @@ def test_errors_that_never_come_back_are_no_noise_of_the_measurement() -> None:
     held = {}
     for noise in ("trajectory", "chosen"):
         settings = CalibrationSettings(posterior="laplace", noise=noise)
-        found = LaplaceMethod().find(solver, batch, batch.lengths - 1, best, settings)
-        value = torch.tensor(truth[list(found.names)].to_numpy())
-        held[noise] = float(((found.low <= value) & (value <= found.high)).double().mean())
+        intervals = LaplaceMethod().find(solver, batch, batch.lengths - 1, best, settings)
+        value = torch.tensor(truth[list(intervals.names)].to_numpy())
+        held[noise] = float(((intervals.low <= value) & (value <= intervals.high)).double().mean())
     assert held["trajectory"] < 0.84
     assert 0.85 < held["chosen"] < 0.97
 
