@@ -9,7 +9,6 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import ClassVar
 
 import pandas as pd
@@ -24,6 +23,7 @@ from cfx.core.engine import Engine
 from cfx.core.local_engine import LocalEngine
 from cfx.data.pairs import PairBatch
 from cfx.errors import ConfigError
+from cfx.learners.workspace import Workspace
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.features import Scaler
@@ -90,8 +90,8 @@ class TrainingData:
         windows: how trajectories are cut.
         names: what each network is for, N of them.
         seed: for initial weights and everything random.
-        workspace: a folder for what training needs to go on after an interruption; None: nothing is
-            kept.
+        workspace: has files for what training needs to go on after an interruption; None: nothing
+            is kept.
         objective: what training that simulates in closed loop minimises; calibration has minimised
             it too.
         engine: where independent networks may train.
@@ -103,7 +103,7 @@ class TrainingData:
     windows: WindowSettings
     names: tuple[str, ...]
     seed: int
-    workspace: Path | None = None
+    workspace: Workspace | None = None
     objective: Objective = field(default_factory=SpeedRmse)
     engine: Engine = field(default_factory=LocalEngine)
 

@@ -148,9 +148,13 @@ class BatchedModule(pl.LightningModule):
         for key, value in self.network.named_parameters():
             chosen = better.to(value.device).view(-1, *[1] * (value.dim() - 1))
             self.best[key] = torch.where(chosen, value.detach(), self.best[key].to(value.device))
+        self._stop_where_none_improves()
+        self.on_epoch()
+
+    def _stop_where_none_improves(self) -> None:
+        patience = self.settings.patience
         if patience is not None and not bool((self.stale < patience).any()):
             self.trainer.should_stop = True
-        self.on_epoch()
 
     def forget_best(self) -> None:
         """Forgets the best epoch so far: later losses are of something else, and do not compare."""
@@ -168,6 +172,7 @@ class BatchedModule(pl.LightningModule):
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         for name in _KEPT:
             setattr(self, name, checkpoint["batched"][name])
+        self._stop_where_none_improves()
         for _ in self.rows:
             self.on_epoch()
 

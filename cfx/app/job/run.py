@@ -63,11 +63,14 @@ def run_job(config: JobConfig, folder: Path, console: Console | None = None) -> 
                 "dataset.pairs": str(len(pairs)),
             }
         )
-        result = steps.find(steps.compose(config, components, pairs, style), components, config)
+        context = steps.compose(config, components, pairs, style)
+        result = steps.find(context, components, config)
         # Figures take seconds: the numbers are there before them.
         result = result.write(
             folder, config, tell=partial(report, console=console, verbose=config.output.verbose)
         )
+        if context.workspace is not None:
+            context.workspace.clear()  # the folder has the policy by now
         # After the folder, so that no failure of MLflow loses it.
         tracker.log_job(result, described(result))
         if upload is not None:

@@ -44,6 +44,7 @@ from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.sites import site_table
 from cfx.learners.base import Learner
 from cfx.learners.curves import learning_curves
+from cfx.learners.workspace import Workspace
 from cfx.models.base import DrivingModel
 from cfx.policies.base import Policy
 from cfx.policies.ready import is_ready_made
@@ -330,10 +331,11 @@ def compose(
     if config.cache.enabled:
         cache_folder = config.cache.folder
         # Behind a URL there is no place for what a training writes every few seconds.
-        workspace = Path("outputs") / "training"
+        folder = Path("outputs") / "training"
         if isinstance(cache_folder, Path):
             cache_folder = cache_folder.expanduser()
-            workspace = cache_folder / "training"
+            folder = cache_folder / "training"
+        workspace = Workspace(folder)
     solver = Solver(
         components.simulator.stepper(components.model, batch.dt),
         components.optimizer.with_effort(

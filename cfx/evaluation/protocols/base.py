@@ -7,7 +7,6 @@ from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from pathlib import Path
 from typing import Any, ClassVar
 
 import pandas as pd
@@ -36,6 +35,7 @@ from cfx.learners.base import (
     TrainingData,
     TrainingPairs,
 )
+from cfx.learners.workspace import Workspace
 from cfx.policies.agent import Agent
 from cfx.policies.base import Policy
 from cfx.simulation.base import Stepper
@@ -56,8 +56,8 @@ class ProtocolContext:
         windows: how trajectories are cut.
         split: share of each pair's windows for training.
         metrics: what is measured; None: cfx's own metrics.
-        workspace: a folder where interrupted training finds what it needs to go on; None: training
-            begins again.
+        workspace: where interrupted training finds what it needs to go on; None: training begins
+            again.
     """
 
     pairs: PairSet
@@ -70,7 +70,7 @@ class ProtocolContext:
     learner: Learner
     windows: WindowSettings
     split: float
-    workspace: Path | None = None
+    workspace: Workspace | None = None
     metrics: MetricSet | None = None
 
     @property

@@ -33,12 +33,11 @@ from cfx.learners.rollout.sampling import augmentation
 from cfx.learners.rollout.settings import RolloutSettings
 from cfx.learners.rollout.shard import (
     TrainedShard,
-    checkpoint_path,
     cut,
     epochs,
-    expert_checkpoint,
     networks_of_shards,
     shard_checkpoints,
+    training_key,
     untrained,
 )
 from cfx.learners.rollout.simulated import with_simulated_drivers
@@ -166,9 +165,9 @@ class RolloutLearner(Learner):
         from cfx.learners.rollout.module import train
 
         s = self.settings
-        checkpoint = checkpoint_path(self.identity(), policy, training_data)
+        training = training_key(self.identity(), policy, training_data)
         networks = networks_of_shards(s, dataset)
-        files = shard_checkpoints(checkpoint, networks)
+        files = shard_checkpoints(training_data.workspace, training, networks)
         shards = cut(s, policy, training_data, dataset, network, networks, files)
         count, at_most = len(networks), epochs(s)
         title = f"Training ({len(dataset.pair)} networks, at most {at_most} epochs)"
@@ -189,10 +188,6 @@ class RolloutLearner(Learner):
         if factors:
             # The geometric mean of an ensemble's members.
             dispersion = torch.cat(factors).log().view(-1, s.ensemble_size).mean(1).exp()
-        for file in files:
-            if file is not None:
-                file.unlink(missing_ok=True)
-                expert_checkpoint(file).unlink(missing_ok=True)
         return curves, dispersion
 
 

@@ -28,6 +28,7 @@ from cfx.learners.rollout.dataset import RolloutDataset
 from cfx.learners.rollout.equilibrium import EquilibriumTargets
 from cfx.learners.rollout.loss import BaseErrors
 from cfx.learners.rollout.settings import RolloutSettings
+from cfx.learners.workspace import Workspace
 from cfx.models.direct import Direct
 from cfx.policies.base import Policy, PolicyNetwork
 from cfx.policies.heads import head_class
@@ -36,18 +37,14 @@ from cfx.policies.heads.offset import OffsetHead
 from cfx.simulation.rollout import MemoryStepper
 
 
-def checkpoint_path(
-    learner: dict[str, Any], policy: Policy, training_data: TrainingData
-) -> Path | None:
-    """Returns the file from which this very training goes on, or None without a workspace.
+def training_key(learner: dict[str, Any], policy: Policy, training_data: TrainingData) -> str:
+    """Returns what tells this very training from others, for the names of its files.
 
     Args:
         learner: identity of the learner.
         policy: what is trained.
         training_data: what it is trained on.
     """
-    if training_data.workspace is None:
-        return None
     digest = hashlib.sha256()
     _add_content(digest, training_data.recorded)
     _add_content(digest, training_data.pairs)
@@ -63,7 +60,7 @@ def checkpoint_path(
         "names": training_data.names,
         "seed": training_data.seed,
     }
-    return training_data.workspace / f"{content_key(description)}.ckpt"
+    return content_key(description)
 
 
 def _add_content(digest: hashlib._Hash, record: Any) -> None:
@@ -180,11 +177,25 @@ def _even(ensembles: int, count: int) -> int:
     return min(counts, key=longest)
 
 
-def shard_checkpoints(checkpoint: Path | None, shards: Sequence[slice]) -> list[Path | None]:
-    """Returns the file of each shard, beside that of the whole training; None: no such file."""
-    if checkpoint is None or len(shards) == 1:
-        return [checkpoint] * len(shards)
-    return [checkpoint.with_suffix(f".{shard.start}-{shard.stop}.ckpt") for shard in shards]
+def shard_checkpoints(
+    workspace: Workspace | None, training: str, shards: Sequence[slice]
+) -> list[Path | None]:
+    """Returns the file of each shard from which its training goes on; None: no such file.
+
+    Args:
+        workspace: of the job.
+        training: as `training_key` returns it.
+        shards: which networks train together.
+    """
+    if workspace is None:
+        return [None] * len(shards)
+    files: list[Path | None] = []
+    for shard in shards:
+        name = training if len(shards) == 1 else f"{training}.{shard.start}-{shard.stop}"
+        file = workspace.file(f"{name}.ckpt")
+        workspace.file(expert_checkpoint(file).name)  # where there are experts
+        files.append(file)
+    return files
 
 
 def expert_checkpoint(checkpoint: Path) -> Path:

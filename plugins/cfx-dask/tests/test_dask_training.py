@@ -13,6 +13,7 @@ from cfx.core.engine import Engine
 from cfx.core.local_engine import LocalEngine
 from cfx.learners.base import TrainingResult
 from cfx.learners.rollout import RolloutLearner, shard
+from cfx.learners.workspace import Workspace
 from cfx_dask.engine.engine import DaskEngine
 from tests.learners.made import QUICK, gru, training_data
 
@@ -27,7 +28,7 @@ def cluster() -> Iterator[Cluster]:
         yield made
 
 
-def trained(engine: Engine, workspace: Path | None) -> TrainingResult:
+def trained(engine: Engine, workspace: Workspace | None) -> TrainingResult:
     """Returns four networks, which train in two shards."""
     data = training_data(networks=4, frames=300, engine=engine, workspace=workspace)
     return RolloutLearner(**SETTINGS).fit(gru(), data)
@@ -52,7 +53,7 @@ def test_workers_that_are_killed_ten_times_change_nothing(
 
     engine = DaskEngine(address=cluster.address)
     with cluster.kills(5, an_epoch_has_ended):
-        found = trained(engine, tmp_path)
+        found = trained(engine, Workspace(tmp_path))
     engine.close()
     weights = expected.network.state_dict()
     for name, value in found.network.state_dict().items():

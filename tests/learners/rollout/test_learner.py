@@ -20,7 +20,8 @@ from cfx.errors import ConfigError
 from cfx.learners.base import TrainingPairs, TrainingResult
 from cfx.learners.rollout import RolloutLearner
 from cfx.learners.rollout.module import RolloutModule
-from cfx.learners.rollout.shard import checkpoint_path
+from cfx.learners.rollout.shard import training_key
+from cfx.learners.workspace import Workspace
 from cfx.models.krauss import Krauss
 from cfx.models.w99 import W99
 from cfx.policies.core import Ensemble
@@ -123,10 +124,11 @@ def test_driver_features_help_to_drive_more_like_each_driver() -> None:
 def test_training_goes_on_where_it_was_interrupted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy, whole = gru(dropout=0.1), training_data(frames=150, workspace=tmp_path / "whole")
+    policy, whole = gru(dropout=0.1), training_data(frames=150)
     learner = RolloutLearner(**(SHORT | {"epochs": 6, "ensemble_size": 2}))
     expected = learner.fit(policy, whole)
-    broken = replace(whole, workspace=tmp_path / "broken")
+    workspace = Workspace(tmp_path / "broken")
+    broken = replace(whole, workspace=workspace)
     judge, epochs = RolloutModule.judge, []
 
     def interrupt(self: RolloutModule, *losses: torch.Tensor, **options: bool) -> None:
@@ -144,17 +146,40 @@ def test_training_goes_on_where_it_was_interrupted(
     assert epochs == [1, 2, 3, 3, 4, 5, 6]
     pd.testing.assert_frame_equal(again.curves, expected.curves)
     assert_same_weights(again, expected)
-    # Nothing is kept of a training that ended.
+    workspace.clear()
     assert not list(tmp_path.glob("*/*"))
+
+
+@pytest.mark.parametrize("stops_early", [False, True])
+def test_training_that_ended_is_not_done_again_until_the_workspace_is_cleared(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, stops_early: bool
+) -> None:
+    """A job may be interrupted after it, while it simulates."""
+    workspace = Workspace(tmp_path)
+    data, ended = training_data(frames=150, workspace=workspace), {"epochs": 4}
+    if stops_early:
+        ended |= {"patience": 1, "learning_rate": 1e-12}  # no epoch is better than the first
+    learner = RolloutLearner(**(SHORT | ended))
+    expected = learner.fit(gru(), data)
+    assert (expected.curves["epoch"].max() < 3) == stops_early
+    with monkeypatch.context() as patched:
+        patched.setattr(RolloutModule, "judge", None)
+        again = learner.fit(gru(), data)
+    pd.testing.assert_frame_equal(again.curves, expected.curves)
+    assert_same_weights(again, expected)
+    assert list(tmp_path.iterdir())
+    workspace.clear()
+    assert not list(tmp_path.iterdir())
 
 
 def test_neither_experts_nor_their_students_train_twice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    policy, whole = gru(), training_data(networks=1, frames=150, workspace=tmp_path / "whole")
+    policy, whole = gru(), training_data(networks=1, frames=150)
     learner = RolloutLearner(**(SHORT | {"epochs": 4, "distillation_epochs": 2}))
     expected = learner.fit(policy, whole)
-    broken = replace(whole, workspace=tmp_path / "broken")
+    workspace = Workspace(tmp_path / "broken")
+    broken = replace(whole, workspace=workspace)
     judge, epochs = RolloutModule.judge, []
 
     def interrupt(self: RolloutModule, *losses: torch.Tensor, **options: bool) -> None:
@@ -172,25 +197,24 @@ def test_neither_experts_nor_their_students_train_twice(
     assert epochs[4:] == [("student", 2), ("student", 2), ("student", 3), ("student", 4)]
     pd.testing.assert_frame_equal(again.curves, expected.curves)
     assert_same_weights(again, expected)
+    workspace.clear()
     assert not list(tmp_path.glob("*/*"))
 
 
-def test_a_checkpoint_of_another_training_is_not_taken_up(tmp_path: Path) -> None:
-    policy, learner = gru(), RolloutLearner(**QUICK)
-    data = training_data(workspace=tmp_path)
-    found = checkpoint_path(learner.identity(), policy, data)
-    assert found == checkpoint_path(learner.identity(), policy, training_data(workspace=tmp_path))
-    assert found != checkpoint_path(learner.identity(), policy, replace(data, seed=1))
-    assert found != checkpoint_path(learner.identity(), policy, replace(data, objective=GapRmse()))
-    assert found != checkpoint_path(
-        RolloutLearner(**(QUICK | {"steps": 16})).identity(), policy, data
-    )
+def test_a_checkpoint_of_another_training_is_not_taken_up() -> None:
+    policy, data, learner = gru(), training_data(), RolloutLearner(**QUICK).identity()
+    key = training_key(learner, policy, data)
+    assert key == training_key(learner, policy, training_data())
+    assert key != training_key(learner, policy, replace(data, seed=1))
+    assert key != training_key(learner, policy, replace(data, objective=GapRmse()))
+    longer = RolloutLearner(**(QUICK | {"steps": 16})).identity()
+    assert key != training_key(longer, policy, data)
 
 
-def test_a_checkpoint_of_other_data_is_not_taken_up(tmp_path: Path) -> None:
+def test_a_checkpoint_of_other_data_is_not_taken_up() -> None:
     """Whatever is changed of the recordings or of what is learned from them gives another file."""
     policy, identity = gru(), RolloutLearner(**QUICK).identity()
-    data = training_data(workspace=tmp_path, base=TRUE * 1.3)
+    data = training_data(base=TRUE * 1.3)
     rain = torch.ones_like(data.recorded.leader_speed)
     data = replace(data, recorded=replace(data.recorded, surroundings={RAIN: rain}))
     others = []
@@ -212,7 +236,7 @@ def test_a_checkpoint_of_other_data_is_not_taken_up(tmp_path: Path) -> None:
                 assert (field.name, value) == ("labels", None)
                 continue
             others.append(replace(data, **{name: replace(record, **{field.name: value})}))
-    files = {checkpoint_path(identity, policy, one) for one in (data, *others)}
+    files = {training_key(identity, policy, one) for one in (data, *others)}
     assert len(others) == len(fields(PairBatch)) + len(fields(TrainingPairs)) - 1
     assert len(files) == 1 + len(others)
 
