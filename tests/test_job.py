@@ -455,3 +455,28 @@ def test_a_calibration_has_one_number_and_no_policy_that_repeats_another_method(
     own = f"RMSE of speed driver-specific {result.metrics['rmse_speed/driver_specific']:.3f} m/s"
     said = [capsys.readouterr().out, repr(result), repr(cfx.load(result.folder))]
     assert all(own in one for one in said)
+
+
+def test_a_job_that_is_interrupted_after_training_trains_nothing_again(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What comes after training may take longer than it, and the networks are written at the end."""
+    workspace = Path("outputs", "cache", "training")
+    small = ["learner=rollout", "learner.epochs=1", "protocol=across_drivers", "protocol.folds=2"]
+
+    def interrupt(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patched:
+        patched.setattr(steps, "calibration_tables", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run(*small, "hydra.run.dir=first")
+    (checkpoint,) = workspace.iterdir()
+    again = run(*small, "hydra.run.dir=again")
+    assert (
+        f"Training goes on from {workspace / checkpoint.name}"
+        in (again.folder / "cfx.log").read_text()
+    )
+    assert not list(workspace.iterdir())
+    straight = run(*small, "hydra.run.dir=straight", "cache.enabled=false")
+    assert again.metrics == pytest.approx(straight.metrics, nan_ok=True)
