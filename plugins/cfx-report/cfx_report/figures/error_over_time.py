@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from cfx.plugin import JobFigure, PairTrajectory, Result, canvas, colours
+from cfx_report.figures.simulated_methods import simulated_methods
 
 TIME_TITLE = "time since the test part began (s)"
 
@@ -89,9 +90,4 @@ class ErrorOverTime(JobFigure):
         """Draws it where trajectories are known."""
         if not len(result.trajectories):
             return None
-        simulated = result.trajectories[0].speed
-        methods = []
-        for method in result.shown_methods:
-            if method in simulated and method not in canvas.HIDDEN:
-                methods.append(method)
-        return draw_errors(result.trajectories, methods, result.transient_s)
+        return draw_errors(result.trajectories, simulated_methods(result), result.transient_s)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from matplotlib.figure import Figure
 
 from cfx.plugin import JobFigure, PairTrajectory, Result, canvas, colours, pair_lines, wording
+from cfx_report.figures.simulated_methods import simulated_methods
 
 _PAIRS = 3
 
@@ -60,9 +61,5 @@ class Following(JobFigure):
         """Draws it where trajectories are known."""
         if not len(result.trajectories):
             return None
-        methods = []
-        for method in result.shown_methods:
-            if method in result.trajectories[0].speed and method not in canvas.HIDDEN:
-                methods.append(method)
         pairs = [trajectory for _, trajectory in pair_lines.chosen_pairs(result, None, _PAIRS)]
-        return draw_following(pairs, methods)
+        return draw_following(pairs, simulated_methods(result))

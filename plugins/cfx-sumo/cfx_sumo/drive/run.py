@@ -366,15 +366,18 @@ def _collisions_of_sumo(
                 is_driven |= fleet.has_type(reported.victimType)
                 if not is_driven:
                     continue
+                is_crossing = _is_crossing(reported)
+                gap = None if is_crossing else _gap_on_lane(sumo, reported)
+                if gap is not None and gap > 0.0:
+                    continue  # below minGap
                 pair = reported.collider, reported.victim
-                if _is_crossing(reported):
-                    crossing += pair not in before  # one that lasts for steps counts once
-                else:
-                    gap = _gap_on_lane(sumo, reported)
-                    if gap is not None and gap > 0.0:
-                        continue
-                    behind += pair not in before
                 touching.add(pair)
+                if pair in before:
+                    continue  # one that lasts for steps counts once
+                if is_crossing:
+                    crossing += 1
+                else:
+                    behind += 1
             before = touching
             task.advance()
     return CollisionCounts(behind, crossing)
@@ -819,7 +822,6 @@ class _Run:
     def _note_collisions(self, dt: float) -> None:
         """Notes the collisions that SUMO reports after a step; one that goes on is one."""
         now = self._sumo.simulation.getTime()
-        departed = self._sumo.simulation.getDepartedIDList()
         touching = {}
         for reported in self._sumo.simulation.getCollisions():
             kind = self._type_of.get(reported.collider) or self._type_of.get(reported.victim)
@@ -837,7 +839,7 @@ class _Run:
                     reported.pos,
                     gap,
                     crossing=_is_crossing(reported),
-                    inserted=reported.collider in departed,
+                    inserted=reported.collider in self._sumo.simulation.getDepartedIDList(),
                 )
                 self._collisions.append(collision)
             elif collision.gap is not None and gap_before is not None:
