@@ -122,6 +122,7 @@ from .calibration.settings import (
     INTERVAL_LEVEL as INTERVAL_LEVEL,
     MAX_PARETO_K as MAX_PARETO_K,
     MIN_NARROWING as MIN_NARROWING,
+    MIXED as MIXED,
     are_reliable as are_reliable,
 )
 from .calibration.shards import Solver as Solver

@@ -37,10 +37,10 @@ class DriverPosteriors(ABC):
 
         `median_NAME`, `low_NAME`, `high_NAME`, `contraction_NAME`, `noise_scale`,
         `noise_correlation`, `noise_left`, `effective_samples`, and `pareto_k` (with
-        `expected_coverage`, if a network has learned) or `r_hat` and `divergences`; where forecasts
-        were compared with held-out parts, `held` and `held_chance`; where there are several kinds
-        of noise, `noise` and `noise_gain`; `likelihood_power`, where the model declares one. The
-        table says what they mean.
+        `expected_coverage`, if a network has learned) or `r_hat` (and `divergences`); where
+        forecasts were compared with held-out parts, `held` and `held_chance`; where there are
+        several kinds of noise, `noise` and `noise_gain`; `likelihood_power`, where the model
+        declares one. The table says what they mean.
         """
 
     @abstractmethod

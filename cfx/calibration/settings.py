@@ -148,5 +148,6 @@ def are_reliable(rows: pd.DataFrame) -> pd.Series:
         rows: of the table `fits`, with the diagnostics of weighted samples or of chains.
     """
     if "r_hat" in rows:
-        return (rows["r_hat"] <= MIXED) & (rows["divergences"] <= DIVERGENT)
+        mixed = rows["r_hat"] <= MIXED
+        return mixed & (rows["divergences"] <= DIVERGENT) if "divergences" in rows else mixed
     return rows["pareto_k"] <= MAX_PARETO_K

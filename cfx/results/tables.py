@@ -543,7 +543,9 @@ class Fits(ResultTable):
             "share of simulated drivers' parameters that the network's 90 % intervals hold (`sbi`)",
             required=False,
         ),
-        Column("r_hat", "1", "of chains: above 1.05 the same (`nuts`)", required=False),
+        Column(
+            "r_hat", "1", "of chains: above 1.05 the same (`nuts`, `hierarchical`)", required=False
+        ),
         Column("divergences", "1", "share of draws: above 0.01 the same (`nuts`)", required=False),
     )
 

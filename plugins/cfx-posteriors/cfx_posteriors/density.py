@@ -278,6 +278,20 @@ class Posterior:
         likelihood = noise.log_density(products, self.count, place[..., self.simulated :])
         return likelihood + self.prior_log_density(place)
 
+    def likelihood(self, place: Tensor) -> Tensor:
+        """Returns the log likelihood whatever the noise's scale, `(P, q)`.
+
+        With the density a priori of what is no parameter of the model: gain and correlations.
+
+        Args:
+            place: coordinates but for the last, `(P, q, d - 1)`.
+        """
+        products = self.products(place)
+        of_noise = place[..., self.simulated :]
+        likelihood = noise.marginal_log_density(products, self.count, of_noise)
+        n = len(self.space)
+        return likelihood + self.prior_log_density(place) - self.prior.log_density(place[..., :n])
+
     def prior_log_density(self, place: Tensor) -> Tensor:
         """Returns the log density a priori of coordinates `(P, q, s)`, or more, `(P, q)`.
 

@@ -35,23 +35,26 @@ from cfx.plugin import (
     squashed,
     threads,
 )
+from cfx_posteriors.chains import Chains
 from cfx_posteriors.density import ParameterPrior, Posterior
 from cfx_posteriors.fan import Fan, fan_of
 from cfx_posteriors.importance import DRAWS, Sampled, sample
 from cfx_posteriors.laplace import Normal, laplace, likely_starts, log_evidence
 from cfx_posteriors.noise import NOISE_KINDS, noise_kind
-from cfx_posteriors.population import SAMPLES, Population, fit_population
+from cfx_posteriors.population import Population, fit_population
 
 if TYPE_CHECKING:
     from xarray import DataTree
 
     from cfx_posteriors.neural import Learned
-    from cfx_posteriors.nuts import Chains
 
 _SHARES = (0.5 - 0.5 * INTERVAL_LEVEL, 0.5, 0.5 + 0.5 * INTERVAL_LEVEL)
 
 NEW_DRIVERS = 1000
 """Drivers that are drawn from a prior or a population and kept."""
+
+SAMPLES = 1000
+"""Of each driver alone, from which chains of a population start and make their moves."""
 
 _WORK = 10**8
 """Vehicle steps that belong together: enough for a compiled kernel."""
@@ -282,10 +285,7 @@ class HierarchicalMethod(PosteriorMethod):
         best: Tensor,
         settings: CalibrationSettings,
     ) -> ParameterIntervals:
-        with threads.one_thread():
-            noise = choose_noise(solver, batch, last, best, settings)
-
-        def draw(posterior: Posterior, normal: Normal) -> Sampled:
+        def draw(posterior: Posterior, normal: Normal) -> Tensor:
             return sample(
                 posterior,
                 normal,
@@ -294,13 +294,19 @@ class HierarchicalMethod(PosteriorMethod):
                 memory=solver.memory,
                 draws=SAMPLES,
                 apart=True,
-            )
+            ).draws
 
         with threads.one_thread():
-            population, likeliest, sampled = fit_population(
-                noise.posterior, noise.normal, draw, _shares(), seed=solver.seed
+            noise = choose_noise(solver, batch, last, best, settings)
+            population, likeliest, chains = fit_population(
+                noise.posterior,
+                noise.normal,
+                draw,
+                _shares(),
+                seed=solver.seed,
+                memory=solver.memory,
             )
-        places = (noise.posterior, likeliest, population, sampled)
+        places = (noise.posterior, likeliest, population, chains)
         return _intervals(solver, batch, last, noise, places)
 
 

@@ -9,8 +9,7 @@ what is left to learn is the length of a step. The scale of the noise is no coor
 its distribution given the others is known, and without it densities fall less steeply.
 
 M. D. Hoffman and A. Gelman (2014), *The No-U-Turn sampler*, Journal of Machine Learning Research
-15. A. Vehtari, A. Gelman, D. Simpson, B. Carpenter and P.-C. Bürkner (2021), *Rank-normalization,
-folding, and localization: an improved R-hat*, Bayesian Analysis 16(2).
+15.
 
 Shapes: P drivers, C chains, n tuned parameters, d coordinates, e = d - 1 without the noise's scale.
 """
@@ -25,12 +24,12 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from arviz_stats.base.array import array_stats
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator
 from torch import Tensor
 
 from cfx.plugin import Task, threads
+from cfx_posteriors.chains import Chains, chains_of
 from cfx_posteriors.density import Posterior
 from cfx_posteriors.importance import Sampled
 
@@ -81,35 +80,6 @@ _FAR = 6.0
 
 _LEAST_RISE = 0.02
 """Of a coordinate for each of its normal scores, in standard deviations."""
-
-
-class Chains(NamedTuple):
-    """Chains of P drivers.
-
-    Attributes:
-        quantiles: of each parameter's logit, `(P, shares, n)`.
-        draws: of all coordinates, a chain after the other, `(P, C * DRAWS, d)`.
-        effective: effective sample size (ArviZ; in the middle and in the tails), of the coordinate
-            with the least, `(P,)`.
-        r_hat: of the coordinate with the largest, `(P,)`.
-        divergences: share of the draws whose trees ended where energy is not kept, `(P,)`.
-    """
-
-    quantiles: Tensor
-    draws: Tensor
-    effective: Tensor
-    r_hat: Tensor
-    divergences: Tensor
-
-    @property
-    def chains(self) -> int:
-        """C."""
-        return CHAINS
-
-    @property
-    def diagnostics(self) -> dict[str, Tensor]:
-        """What says how far to trust them, `(P,)` each."""
-        return {"r_hat": self.r_hat, "divergences": self.divergences}
 
 
 class _Walk(NamedTuple):
@@ -258,34 +228,14 @@ def walk(
     kept = 4 * CHAINS * DRAWS * (d + 4) * torch.float64.itemsize
     at_once = max(CHAINS * (n + 1), DRAWS)
     size = max(1, memory // (at_once * posterior.bytes_per_candidate + kept))
-    parts = []
+    places, diverges = [], []
     for drivers in torch.split(torch.arange(len(sampled.draws)), size):
-        places, diverges = _walked(posterior.take(drivers), sampled.draws[drivers], seed)
-        effective = torch.from_numpy(effective_samples(places.numpy()))
-        r_hat = array_stats.rhat(places.numpy(), chain_axis=1, draw_axis=2).max(-1)
-        draws = places.flatten(1, 2)
-        parts.append(
-            Chains(
-                draws[..., :n].quantile(shares, dim=1).transpose(0, 1),
-                draws,
-                effective,
-                torch.from_numpy(r_hat),
-                diverges.double().mean((1, 2)),
-            )
-        )
-    return Chains(*(torch.cat(values) for values in zip(*parts, strict=True)))
-
-
-def effective_samples(chains: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Returns the effective sample size of the coordinate with the least, `(P,)`.
-
-    Args:
-        chains: `(P, C, draws, d)`.
-    """
-    bulk = array_stats.ess(chains, chain_axis=1, draw_axis=2)
-    tails = array_stats.ess(chains, chain_axis=1, draw_axis=2, method="tail", prob=(0.05, 0.95))
-    least: NDArray[np.float64] = np.minimum(bulk, tails).min(-1)
-    return least
+        walked = _walked(posterior.take(drivers), sampled.draws[drivers], seed)
+        places.append(walked[0])
+        diverges.append(walked[1])
+    chains = chains_of(torch.cat(places), n, shares)
+    divergences = torch.cat(diverges).double().mean((1, 2))
+    return chains._replace(diagnostics={**chains.diagnostics, "divergences": divergences})
 
 
 def _walked(posterior: Posterior, sampled: Tensor, seed: int) -> tuple[Tensor, Tensor]:

@@ -17,13 +17,10 @@ from cfx_posteriors import nuts
 from cfx_posteriors.netcdf import NetcdfExport
 
 
-@pytest.mark.parametrize(
-    ("method", "others"), [("laplace", "prior"), ("hierarchical", "population")]
-)
-def test_a_jobs_posterior_is_labelled_arrays(method: str, others: str, tmp_path: Path) -> None:
+def test_a_jobs_posterior_is_labelled_arrays(tmp_path: Path) -> None:
     quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures=none"]
     job = [f"hydra.run.dir={tmp_path}/job", "tracking.enabled=false"]
-    result = cfx.run([*quick, *job, f"calibration.posterior={method}"])
+    result = cfx.run([*quick, *job, "calibration.posterior=laplace"])
     said = NetcdfExport().write(str(result.folder), None)
     assert "200 draws for each of 4 pairs" in said[0]
     tree = xr.open_datatree(tmp_path / "job" / "posterior.nc", engine="h5netcdf")
@@ -33,20 +30,27 @@ def test_a_jobs_posterior_is_labelled_arrays(method: str, others: str, tmp_path:
         one = tree["posterior"]["t_r"].sel(pair=pair_id, chain=0)
         np.testing.assert_array_equal(one.to_numpy(), rows["parameter_t_r"])
     assert tree["posterior"]["t_r"].attrs["units"] == "s"
-    new = pd.read_parquet(tmp_path / "job" / f"{others}.parquet")
-    np.testing.assert_array_equal(tree[others]["t_i"][0].to_numpy(), new["parameter_t_i"])
+    new = pd.read_parquet(tmp_path / "job" / "prior.parquet")
+    np.testing.assert_array_equal(tree["prior"]["t_i"][0].to_numpy(), new["parameter_t_i"])
     assert dict(tree["diagnostics"]["pareto_k"].sizes) == {"pair": 4}
 
 
-def test_chains_are_a_dimension(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("method", "of_each", "others"), [("nuts", 50, "prior"), ("hierarchical", 100, "population")]
+)
+def test_chains_are_a_dimension(
+    method: str, of_each: int, others: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(nuts, "WARM_UP", 50)
     monkeypatch.setattr(nuts, "DRAWS", 50)
     quick = ["debug=quick", "policy=fixed", "data.frames=200", "figures=none"]
     job = [f"hydra.run.dir={tmp_path}/job", "tracking.enabled=false"]
-    result = cfx.run([*quick, *job, "calibration.posterior=nuts"])
+    result = cfx.run([*quick, *job, f"calibration.posterior={method}"])
     NetcdfExport().write(str(result.folder), None)
     tree = xr.open_datatree(tmp_path / "job" / "posterior.nc", engine="h5netcdf")
-    assert tree["posterior"].sizes == {"chain": nuts.CHAINS, "draw": 50, "pair": 4}
+    assert tree["posterior"].sizes == {"chain": nuts.CHAINS, "draw": of_each, "pair": 4}
+    new = pd.read_parquet(tmp_path / "job" / f"{others}.parquet")
+    np.testing.assert_array_equal(tree[others]["t_i"][0].to_numpy(), new["parameter_t_i"])
     draws = pd.read_parquet(tmp_path / "job" / "posterior.parquet")
     fits = pd.read_parquet(tmp_path / "job" / "fits.parquet").query("method == 'driver_specific'")
     for pair_id, rows in draws.groupby("pair_id"):

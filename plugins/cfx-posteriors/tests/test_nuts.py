@@ -31,7 +31,7 @@ def test_chains_agree_with_weighted_samples_and_come_again(monkeypatch: pytest.M
     apart = (found.quantiles - weighted.quantiles) / deviation
     assert float(apart.abs().max()) < 0.4
     assert float(found.effective.min()) > 100
-    assert float(found.r_hat.max()) < 1.05
+    assert float(found.diagnostics["r_hat"].max()) < 1.05
     again = walk(posterior, weighted, SHARES, seed=0, memory=1 << 30)
     torch.testing.assert_close(again.draws, found.draws, rtol=0, atol=0)
 

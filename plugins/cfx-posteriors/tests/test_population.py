@@ -8,12 +8,15 @@ import pytest
 import torch
 from torch import Tensor
 
+from cfx.core.progress import Task
 from cfx.models.krauss import Krauss
 from cfx_posteriors import population
+from cfx_posteriors.chains import Chains
 from cfx_posteriors.density import Posterior
-from cfx_posteriors.importance import DRAWS, Sampled, sample
+from cfx_posteriors.importance import sample
+from cfx_posteriors.intervals import SAMPLES
 from cfx_posteriors.laplace import Normal, laplace
-from cfx_posteriors.population import SAMPLES, Population, fit_population
+from cfx_posteriors.population import CHAINS, Population, fit_population
 
 from .recordings import draw_recordings
 
@@ -25,6 +28,7 @@ TRUE = Population(
 )
 SHARES = torch.tensor([0.05, 0.5, 0.95], dtype=torch.float64)
 DRIVERS, FEW = 60, 6
+MEMORY = 1 << 30
 
 
 class Fitted(NamedTuple):
@@ -34,18 +38,22 @@ class Fitted(NamedTuple):
     alone: Normal
     population: Population
     likeliest: Tensor
-    within: Sampled
+    within: Chains
+
+
+def laplace_of(posterior: Posterior) -> Normal:
+    assert posterior.prior.center is not None
+    return laplace(posterior, posterior.prior.center.expand(posterior.segments.problems, 1, -1))
+
+
+def draw(posterior: Posterior, normal: Normal) -> Tensor:
+    settings = {"seed": 0, "memory": MEMORY, "draws": SAMPLES}
+    return sample(posterior, normal, SHARES, **settings, apart=True).draws
 
 
 def fitted(posterior: Posterior, truth: Tensor) -> Fitted:
-    assert posterior.prior.center is not None
-    alone = laplace(posterior, posterior.prior.center.expand(len(truth), 1, -1))
-
-    def draw(posterior: Posterior, normal: Normal) -> Sampled:
-        memory = 1 << 30
-        return sample(posterior, normal, SHARES, seed=0, memory=memory, draws=SAMPLES, apart=True)
-
-    of_all = fit_population(posterior, alone, draw, SHARES, seed=0)
+    alone = laplace_of(posterior)
+    of_all = fit_population(posterior, alone, draw, SHARES, seed=0, memory=MEMORY)
     return Fitted(truth[:, : len(SPACE)], alone, *of_all)
 
 
@@ -77,7 +85,8 @@ def test_intervals_of_mean_scatter_and_drivers_hold_the_truth(whole: Fitted) -> 
         least, most = draws.quantile(ends, dim=0)
         assert bool(((least < true) & (true < most)).all())
     below = (whole.within.draws[..., :2] < whole.truth[:, None]).double().mean(1)
-    assert whole.within.draws.shape == (DRIVERS, DRAWS, 4)
+    assert whole.within.draws.shape == (DRIVERS, 100 * CHAINS, 4)
+    assert float((whole.within.diagnostics["r_hat"] < 1.05).double().mean()) > 0.9
     assert bool((below[~held] < 0.08).logical_or(below[~held] > 0.92).all())
 
 
@@ -87,20 +96,35 @@ def test_fewer_drivers_say_less_of_the_population(whole: Fitted) -> None:
     assert bool((few.mean.std(0) > 2.0 * whole.population.mean.std(0)).all())
 
 
-def test_without_drivers_deviations_are_half_t_and_correlations_uniform() -> None:
-    nobody, variances = torch.zeros((0, 2)).double(), torch.tensor([2.25, 9.0]).double()
-    generator = torch.Generator().manual_seed(0)
-    scales, draws = variances, []
-    for _ in range(8000):
-        covariance, scales = population._covariance(nobody, scales, variances, generator)
-        draws.append(covariance)
-    deviation = torch.stack(draws).diagonal(dim1=1, dim2=2).sqrt()
-    # Half of a t distribution with 2 degrees of freedom is within 0.8165.
-    median = deviation.median(0).values
-    torch.testing.assert_close(median, 0.8165 * variances.sqrt(), rtol=0.1, atol=0)
-    correlation = torch.stack(draws)[:, 0, 1] / deviation.prod(1)
+class Unheard(Krauss):
+    """Recordings of it say nothing."""
+
+    likelihood_power = 0.0
+
+
+def test_without_recordings_deviations_are_half_t_and_correlations_uniform() -> None:
+    # Whatever moves drivers and populations, together or apart, leaves what is known a priori.
+    drawn = draw_recordings(Unheard(), 3, frames=60)
+    alone = drawn.posterior
+    samples = draw(alone, laplace_of(alone))[..., :-1]
+    walk = population._Walk(alone, alone, samples, seed=0, memory=MEMORY)
+    task = Task("Sampling", 0)
+    walk.go_on(200, task, learning=True)
+    kept = [state for _ in range(2) for state in walk.go_on(600, task)]
+    covariance = torch.cat([state.covariance for state in kept])
+    deviation = covariance.diagonal(dim1=1, dim2=2).sqrt()
+    prior = torch.linalg.inv(alone.prior.precision).diagonal().sqrt()
+    # Half of a t distribution with 2 degrees of freedom is within 0.8165, a quarter within 0.3652.
+    shares = torch.tensor([0.25, 0.5], dtype=torch.float64)
+    expected = torch.tensor([0.3652, 0.8165]).double()[:, None] * prior
+    torch.testing.assert_close(deviation.quantile(shares, dim=0), expected, rtol=0.15, atol=0)
+    correlation = covariance[:, 0, 1] / deviation.prod(1)
     quartiles = correlation.quantile(torch.tensor([0.25, 0.5, 0.75], dtype=torch.float64))
-    assert quartiles.tolist() == pytest.approx([-0.5, 0.0, 0.5], abs=0.05)
+    assert quartiles.tolist() == pytest.approx([-0.5, 0.0, 0.5], abs=0.1)
+    mean = torch.cat([state.mean for state in kept])
+    assert alone.prior.center is not None
+    torch.testing.assert_close(mean.mean(0), alone.prior.center, atol=0.2, rtol=0)
+    torch.testing.assert_close(mean.std(0), prior, rtol=0.1, atol=0)
 
 
 def test_drawn_drivers_are_as_correlated_as_the_population_and_within_bounds() -> None:

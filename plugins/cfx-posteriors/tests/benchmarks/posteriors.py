@@ -37,14 +37,15 @@ from cfx.models.w99 import W99
 from cfx.simulation.base import Simulator
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.trajectory import Segments
+from cfx_posteriors.chains import Chains, effective_samples
 from cfx_posteriors.density import DEVIATION, Posterior
 from cfx_posteriors.importance import DRAWS, Sampled, sample
-from cfx_posteriors.intervals import LaplaceMethod, posterior_of
+from cfx_posteriors.intervals import SAMPLES, LaplaceMethod, posterior_of
 from cfx_posteriors.laplace import Normal, laplace, likely_starts
 from cfx_posteriors.neural import Learned, learn
 from cfx_posteriors.noise import RATE, SHAPE
-from cfx_posteriors.nuts import CHAINS, Chains, effective_samples, walk
-from cfx_posteriors.population import SAMPLES, fit_population
+from cfx_posteriors.nuts import CHAINS, walk
+from cfx_posteriors.population import fit_population
 from cfx_posteriors.tempered import tempered
 
 from ..recordings import draw_recordings
@@ -231,9 +232,9 @@ def nuts(name: str) -> Iterator[str]:
         f" samples {before:.1f}), {passed:.0f} s; effective samples: least"
         f" {float(effective[0]):.0f}, then {', '.join(f'{float(e):.0f}' for e in effective[1:4])},"
         f" median {float(effective.median()):.0f}; above 400: {int((effective > 400).sum())};"
-        f" R-hat at most {float(found.r_hat.max()):.3f}, median {float(found.r_hat.median()):.3f};"
-        f" divergent {float(found.divergences.mean()):.2%}, at most"
-        f" {float(found.divergences.max()):.1%}; 5, 50 and 95 % apart from weighted samples"
+        f" R-hat at most {float(found.diagnostics['r_hat'].max()):.3f}, median {float(found.diagnostics['r_hat'].median()):.3f};"
+        f" divergent {float(found.diagnostics['divergences'].mean()):.2%}, at most"
+        f" {float(found.diagnostics['divergences'].max()):.1%}; 5, 50 and 95 % apart from weighted samples"
         f" {float(off.mean()):.2f} deviations in the mean, {float(off.max()):.2f} at most; from"
         f" Laplace's approximation alone {float(of_normal.mean()):.2f}, {float(of_normal.max()):.1f};"
         f" effective samples of all drivers in a CPU second {float(effective.sum()) / spent:.1f}"
@@ -294,8 +295,8 @@ def covered(name: str) -> Iterator[str]:
             f"{type(MODELS[name]).__name__}, {COVERED[name]} drivers, {label}: held"
             f" {float(held.mean()):.1%}, each parameter {shares(held)}; ranks"
             f" {' '.join(f'{c:.0f}' for c in counts.sum(0))}, least p {least:.3f}; reliable"
-            f" {float((found.r_hat <= MIXED).double().mean()):.0%}, divergent"
-            f" {float(found.divergences.mean()):.2%}, effective {float(found.effective.median()):.0f}"
+            f" {float((found.diagnostics['r_hat'] <= MIXED).double().mean()):.0%}, divergent"
+            f" {float(found.diagnostics['divergences'].mean()):.2%}, effective {float(found.effective.median()):.0f}"
         )
 
 
@@ -527,15 +528,19 @@ def forecasts(name: str) -> Iterator[str]:
     starts = likely_starts(alone, seed=0)
     normal = laplace(alone, starts)
 
-    def sampled(posterior: Posterior, normal: Normal) -> Sampled:
-        return sample(posterior, normal, SHARES, seed=0, memory=1 << 30, draws=SAMPLES, apart=True)
+    memory = 1 << 30
 
-    _, likeliest, within = fit_population(alone, normal, sampled, SHARES, seed=0)
+    def sampled(posterior: Posterior, normal: Normal) -> Tensor:
+        return sample(
+            posterior, normal, SHARES, seed=0, memory=memory, draws=SAMPLES, apart=True
+        ).draws
+
+    _, likeliest, within = fit_population(alone, normal, sampled, SHARES, seed=0, memory=memory)
     drawn = {
         "likeliest": normal.mode[:, None].expand(-1, DRAWS, -1),
         "posterior": sample(alone, normal, SHARES, seed=0, memory=1 << 30).draws,
         "likeliest within the population": likeliest[:, None].expand(-1, DRAWS, -1),
-        "posterior within the population": within.draws,
+        "posterior within the population": within.draws[:, :: within.draws.shape[1] // DRAWS],
     }
     whole = posterior_of(solver, batch, last, settings, NOISE)
     for label, draws in drawn.items():
