@@ -4,10 +4,10 @@
 
 Cosmic Ray makes the mutants: another operator, comparison or number, a branch or a decorator left
 out. They are drawn by a seed, the place first and then the change, so that places with many possible
-changes do not outweigh others. What changes annotations alone is left out. Each mutant is a change
-of a copy of the checkout in `.mutants`, and runs against the tests of its room there, those that
-import its module first: the first failure kills it, as does a run of more than three times as long
-as without a change.
+changes do not outweigh others. What changes annotations alone, or `strict` of a `zip`, is left out.
+Each mutant is a change of a copy of the checkout in `.mutants`, and runs against the tests of its
+room there, those that import its module first: the first failure kills it, as does a run of more
+than three times as long as without a change.
 
 Verdicts are kept in `.mutants/verdicts.jsonl`, by the content of what was changed: a run that
 was interrupted goes on, and a mutant of a file that has changed since is tried again. The table of
@@ -100,19 +100,22 @@ def _in_order(node: Any) -> Iterator[Any]:
 
 
 def mutated(mutant: Mutant) -> str | None:
-    """Returns the changed file; None where annotations alone are changed, or nothing."""
+    """Returns the changed file; None where what is changed alone cannot be noticed."""
     mutating = importlib.import_module("cosmic_ray.mutating")
     plugins = importlib.import_module("cosmic_ray.plugins")
     before = (TREE / mutant.module).read_text(encoding="utf-8")
     changes = plugins.get_operator(mutant.operator)()
     after: str | None = mutating.mutate_code(before, changes, mutant.occurrence)
-    if after is None or _without_annotations(after) == _without_annotations(before):
+    if after is None or _noticeable(after) == _noticeable(before):
         return None
     return after
 
 
-def _without_annotations(source: str) -> str:
-    """Returns what Python runs of a file, in one form."""
+def _noticeable(source: str) -> str:
+    """Returns what tests may notice of a file, in one form.
+
+    Without annotations, and without `zip`'s `strict`: it guards against a mistake in the file.
+    """
     try:
         tree = ast.parse(source)
     except SyntaxError:
@@ -122,6 +125,8 @@ def _without_annotations(source: str) -> str:
             node.annotation = ast.Constant(value=None)
         elif isinstance(node, ast.FunctionDef):
             node.returns = None
+        elif isinstance(node, ast.Call):
+            node.keywords = [keyword for keyword in node.keywords if keyword.arg != "strict"]
     return ast.dump(tree)
 
 
