@@ -5,9 +5,10 @@
 Cosmic Ray makes the mutants: another operator, comparison or number, a branch or a decorator left
 out. They are drawn by a seed, the place first and then the change, so that places with many possible
 changes do not outweigh others. What changes annotations alone, or `strict` of a `zip`, is left out.
-Each mutant is a change of a copy of the checkout in `.mutants`, and runs against the tests of its
-room there, those that import its module first: the first failure kills it, as does a run of more
-than three times as long as without a change.
+Each mutant is a change of a copy of the checkout in `.mutants`, and meets those tests of its room
+that run its lines (coverage.py), files with the quickest first; where no test does by itself, as
+with what is run on import, the whole room. The first failure kills it, as does a run of more than
+three times as long as without a change.
 
 Verdicts are kept in `.mutants/verdicts.jsonl`, by the content of what was changed: a run that
 was interrupted goes on, and a mutant of a file that has changed since is tried again. The table of
@@ -22,15 +23,16 @@ import ast
 import hashlib
 import importlib
 import json
+import math
 import os
 import random
 import shutil
 import subprocess
 import sys
-import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 from tests.checkout import ROOT
 
@@ -38,7 +40,7 @@ ROOMS = ("evaluation", "calibration", "learners", "policies", "simulation", "mod
 FOLDER = ROOT / ".mutants"
 TREE = FOLDER / "tree"
 """The copy of the checkout, whose files are changed and tested."""
-LEAST_TIMEOUT_S = 60.0
+LEAST_TIMEOUT_S = 120.0
 SLOWER = 3.0
 """A mutant that takes so many times as long as the tests without a change is killed."""
 
@@ -161,26 +163,108 @@ def copy_checkout() -> None:
             shutil.copyfile(source, target)
 
 
-def tests_of(mutant: Mutant) -> list[str]:
-    """Returns what pytest runs: files of the room that import the module first, then the room."""
-    dotted = mutant.module.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
-    first = []
-    for file in sorted((TREE / "tests" / mutant.room).rglob("test_*.py")):
-        if dotted in file.read_text(encoding="utf-8"):
-            first.append(file.relative_to(TREE).as_posix())
-    return [*first, f"tests/{mutant.room}"]
+class Covered(NamedTuple):
+    """Which tests of a room run which lines.
+
+    Attributes:
+        tests: that run a line, by file of the code and number of the line.
+        seconds: that each test takes, with its fixtures.
+    """
+
+    tests: dict[str, dict[int, list[str]]]
+    seconds: dict[str, float]
+
+    @classmethod
+    def by(cls, room: str) -> Covered:
+        """Returns what the tests of a room run, from the last time if nothing has changed.
+
+        Raises:
+            SystemExit: they fail.
+        """
+        digest = hashlib.sha256()
+        for folder in ("cfx", f"tests/{room}"):
+            for path in sorted((TREE / folder).rglob("*.py")):
+                digest.update(path.read_bytes())
+        file = FOLDER / f"covered-{room}.json"
+        if file.is_file():
+            known = json.loads(file.read_text(encoding="utf-8"))
+            if known["digest"] == digest.hexdigest():
+                by_number = {
+                    module: {int(line): tests for line, tests in lines.items()}
+                    for module, lines in known["tests"].items()
+                }
+                return cls(by_number, known["seconds"])
+        found = cls._measured(room)
+        file.write_text(json.dumps({"digest": digest.hexdigest(), **found._asdict()}))
+        return found
+
+    @classmethod
+    def _measured(cls, room: str) -> Covered:
+        coverage = importlib.import_module("coverage")
+        data, times = FOLDER / f"coverage-{room}", FOLDER / f"times-{room}.xml"
+        data.unlink(missing_ok=True)
+        measuring = ["--cov", f"cfx/{room}", "--cov-context", "test", "--cov-report", ""]
+        tests = [*measuring, "--junitxml", str(times), f"tests/{room}"]
+        if fails(tests, None, COVERAGE_FILE=str(data)):
+            sys.exit(f"tests/{room} fails in a copy without a change: {TREE}")
+        seconds = {}
+        for case in ElementTree.parse(times).iter("testcase"):  # noqa: S314 - pytest's own file
+            name = f"{case.attrib['classname'].replace('.', '/')}.py::{case.attrib['name']}"
+            seconds[name] = float(case.attrib["time"])
+        ran = coverage.CoverageData(basename=str(data))
+        ran.read()
+        by_line: dict[str, dict[int, list[str]]] = {}
+        for module in ran.measured_files():
+            lines = by_line.setdefault(Path(module).relative_to(TREE).as_posix(), {})
+            for line, contexts in ran.contexts_by_lineno(module).items():
+                named = {context.rpartition("|")[0] for context in contexts}
+                lines[line] = sorted(named & seconds.keys())
+        return cls(by_line, seconds)
+
+    def of(self, mutant: Mutant) -> list[str]:
+        """Returns the tests that run the statement of a mutant, files with the quickest first."""
+        lines = self.tests.get(mutant.module, {})
+        found: set[str] = set()
+        for line in _statement(TREE / mutant.module, mutant.line):
+            found.update(lines.get(line, ()))
+        files: dict[str, float] = {}
+        for test in found:
+            file = test.partition("::")[0]
+            files[file] = min(files.get(file, math.inf), self.seconds[test])
+        return sorted(found, key=lambda test: (files[test.partition("::")[0]], test))
 
 
-def fails(tests: Sequence[str], timeout_s: float | None) -> bool | None:
-    """Runs tests of the copy; says whether they fail, None where they take too long."""
+def _statement(path: Path, line: int) -> range:
+    """Returns the lines of the innermost statement that a line is in, without its body."""
+    lines = range(line, line + 1)
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        if isinstance(node, ast.stmt) and node.lineno <= line <= (node.end_lineno or line):
+            body = getattr(node, "body", None)
+            end = body[0].lineno if body else (node.end_lineno or line) + 1
+            if line < end:
+                lines = range(node.lineno, end)
+    return lines
+
+
+def fails(tests: Sequence[str], timeout_s: float | None, **variables: str) -> bool | None:
+    """Runs tests of the copy; says whether they fail, None where they take too long.
+
+    Args:
+        tests: what pytest is told to run.
+        timeout_s: after which they are ended.
+        variables: of the environment, further ones.
+    """
     environment = {
         **os.environ,
         "PYTHONPATH": str(TREE),
         "PYTHONDONTWRITEBYTECODE": "1",
         "CFX_KERNEL_CACHE": str(FOLDER / "kernels"),
+        **variables,
     }
     (FOLDER / "kernels").mkdir(mode=0o700, exist_ok=True)
-    command = [sys.executable, "-m", "pytest", *TESTS, *tests]
+    # Names of many tests are longer than a command may be.
+    (FOLDER / "tests").write_text("\n".join(tests), encoding="utf-8")
+    command = [sys.executable, "-m", "pytest", *TESTS, f"@{FOLDER / 'tests'}"]
     try:
         done = subprocess.run(
             command,
@@ -195,29 +279,19 @@ def fails(tests: Sequence[str], timeout_s: float | None) -> bool | None:
     return done.returncode != 0
 
 
-def seconds_without_change(room: str) -> float:
-    """Returns how long a room's tests take, the second time, when code is compiled.
-
-    Raises:
-        SystemExit: they fail.
-    """
-    tests = [f"tests/{room}"]
-    if fails(tests, None):
-        sys.exit(f"tests/{room} fails in a copy without a change: {TREE}")
-    began = time.monotonic()
-    fails(tests, None)
-    return time.monotonic() - began
-
-
-def judged(mutant: Mutant, timeout_s: float) -> Verdict:
-    """Runs the tests of a mutant's room against it."""
+def judged(mutant: Mutant, covered: Covered) -> Verdict:
+    """Runs tests of a mutant's room against it."""
+    tests = covered.of(mutant)
+    names = tests or covered.seconds
+    usual = sum(covered.seconds[name] for name in names)
+    timeout_s = max(LEAST_TIMEOUT_S, SLOWER * usual)
     path = TREE / mutant.module
     source, changed = path.read_text(encoding="utf-8"), mutated(mutant)
     assert changed is not None
     path.write_text(changed, encoding="utf-8")
     try:
         outcome = {True: "killed", False: "survived", None: "timeout"}
-        verdict = outcome[fails(tests_of(mutant), timeout_s)]
+        verdict = outcome[fails(tests or [f"tests/{mutant.room}"], timeout_s)]
     finally:
         path.write_text(source, encoding="utf-8")
     before, after = _first_difference(source.splitlines(), changed.splitlines())
@@ -281,15 +355,14 @@ def main() -> None:
     FOLDER.mkdir(parents=True, exist_ok=True)
     copy_checkout()
     verdict_of = kept()
-    timeouts: dict[str, float] = {}
+    covered: dict[str, Covered] = {}
     verdicts = []
     for number, mutant in enumerate(drawn(options.rooms, options.count, options.seed), start=1):
         key = key_of(mutant)
         if key not in verdict_of:
-            if mutant.room not in timeouts:
-                usual = seconds_without_change(mutant.room)
-                timeouts[mutant.room] = max(LEAST_TIMEOUT_S, SLOWER * usual)
-            verdict_of[key] = judged(mutant, timeouts[mutant.room])
+            if mutant.room not in covered:
+                covered[mutant.room] = Covered.by(mutant.room)
+            verdict_of[key] = judged(mutant, covered[mutant.room])
             keep(key, verdict_of[key])
         verdicts.append((mutant, verdict_of[key]))
         outcome = verdict_of[key].outcome

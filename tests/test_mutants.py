@@ -66,13 +66,13 @@ def test_survivors_stand_in_the_table() -> None:
     assert "idm.py" not in text
 
 
-def test_tests_that_import_the_module_run_first(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(mutants, "TREE", tmp_path)
-    folder = tmp_path / "tests" / "models"
-    folder.mkdir(parents=True)
-    (folder / "test_all.py").write_text("import cfx\n")
-    (folder / "test_one.py").write_text("from cfx.models.idm import IDM\n")
-    mutant = Mutant("cfx/models/idm.py", "", 0, 1)
-    assert mutants.tests_of(mutant) == ["tests/models/test_one.py", "tests/models"]
+def test_a_mutant_meets_the_tests_that_run_its_statement(module: Path) -> None:
+    module.write_text("X = [\n    1,\n    2,\n]\nif X:\n    Y = 3\n", encoding="utf-8")
+    name = "cfx/models/made.py"
+    ran = {1: ["tests/a.py::slow", "tests/b.py::quick"], 5: ["tests/b.py::quick"], 6: []}
+    seconds = {"tests/a.py::slow": 2.0, "tests/b.py::quick": 0.1, "tests/b.py::other": 1.0}
+    covered = mutants.Covered({name: ran}, seconds)
+    within = Mutant(name, "core/NumberReplacer", 0, 3)
+    assert covered.of(within) == ["tests/b.py::quick", "tests/a.py::slow"]
+    assert covered.of(within._replace(line=5)) == ["tests/b.py::quick"]
+    assert covered.of(within._replace(line=6)) == []
