@@ -30,18 +30,29 @@ def _here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
 
 
-def test_intervals_that_are_not_to_be_relied_on_are_named() -> None:
+@pytest.mark.parametrize(
+    ("diagnostics", "reason"),
+    [
+        ({"pareto_k": [0.3, 0.8]}, "samples of these posteriors do not settle (pareto_k above 0.7"),
+        ({"r_hat": [1.01, 1.2]}, "chains differ (r_hat above 1.05 in"),
+        ({"r_hat": [1.01, 1.2], "divergences": 0.0}, "chains differ or leave out a part"),
+        ({"r_hat": 1.0, "divergences": [0.0, 0.1]}, "chains differ or leave out a part"),
+    ],
+)
+def test_intervals_that_are_not_to_be_relied_on_are_named(
+    diagnostics: dict[str, float | list[float]], reason: str
+) -> None:
     fits = {
         "pair_id": ["a", "b"],
         "method": "driver_specific",
         "noise_scale": 0.1,
         "noise_left": 0.0,
     }
-    rows = pd.DataFrame({**fits, "pareto_k": [0.3, 0.8], "effective_samples": [60.0, 20.0]})
+    rows = pd.DataFrame({**fits, **diagnostics, "effective_samples": [60.0, 20.0]})
     known = KnownParameters(rows, ())
     assert known.metrics()["posterior/reliable"] == 0.5
     said = [str(one) for one in known.printed() if isinstance(one, Text)]
-    assert said[0].startswith("Do not rely on the intervals of 1 of 2 pairs (b):")
+    assert said[0].startswith(f"Do not rely on the intervals of 1 of 2 pairs (b): {reason}")
     assert said[1].startswith("The intervals of 1 of 2 pairs rest on fewer than 100 independent")
 
 

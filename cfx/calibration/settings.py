@@ -148,6 +148,8 @@ def are_reliable(rows: pd.DataFrame) -> pd.Series:
         rows: of the table `fits`, with the diagnostics of weighted samples or of chains.
     """
     if "r_hat" in rows:
-        mixed = rows["r_hat"] <= MIXED
-        return mixed & (rows["divergences"] <= DIVERGENT) if "divergences" in rows else mixed
+        mixed: pd.Series = rows["r_hat"] <= MIXED
+        if "divergences" in rows:
+            mixed &= rows["divergences"] <= DIVERGENT
+        return mixed
     return rows["pareto_k"] <= MAX_PARETO_K

@@ -438,11 +438,13 @@ class KnownParameters:
         if doubtful:
             named = ", ".join(map(str, doubtful[:3])) + (" ..." if len(doubtful) > 3 else "")
             reason = f"samples of these posteriors do not settle (pareto_k above {MAX_PARETO_K}"
-            if "r_hat" in self.rows:
+            if "divergences" in self.rows:
                 reason = (
                     f"chains differ or leave out a part (r_hat above {MIXED} or divergences above"
                     f" {DIVERGENT}"
                 )
+            elif "r_hat" in self.rows:
+                reason = f"chains differ (r_hat above {MIXED}"
             consequence = "too narrow"
             if "expected_coverage" in self.rows:
                 consequence = "the network's alone"
