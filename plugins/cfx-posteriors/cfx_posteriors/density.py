@@ -289,18 +289,20 @@ class Posterior:
         products = self.products(place)
         of_noise = place[..., self.simulated :]
         likelihood = noise.marginal_log_density(products, self.count, of_noise)
-        n = len(self.space)
-        return likelihood + self.prior_log_density(place) - self.prior.log_density(place[..., :n])
+        return likelihood + self._gain_log_density(place)
 
     def prior_log_density(self, place: Tensor) -> Tensor:
         """Returns the log density a priori of coordinates `(P, q, s)`, or more, `(P, q)`.
 
-        That of the noise's coordinates but for the gain is left out. The gain is uniform.
+        That of the noise's coordinates but for the gain is left out.
         """
-        n = len(self.space)
-        gain = place[..., n : self.simulated]
-        uniform = (gain - 2.0 * torch.nn.functional.softplus(gain)).sum(-1)
-        density: Tensor = self.prior.log_density(place[..., :n]) + uniform
+        parameters = place[..., : len(self.space)]
+        return self.prior.log_density(parameters) + self._gain_log_density(place)
+
+    def _gain_log_density(self, place: Tensor) -> Tensor:
+        """Returns that of the gain, which is uniform, `(P, q)`; 0 where none is estimated."""
+        gain = place[..., len(self.space) : self.simulated]
+        density: Tensor = (gain - 2.0 * torch.nn.functional.softplus(gain)).sum(-1)
         return density
 
     def prior_slope(self, place: Tensor) -> Tensor:

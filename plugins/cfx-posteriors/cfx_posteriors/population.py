@@ -339,8 +339,8 @@ class _Walk:
         places[..., parameter] += shift
         mean[:, parameter] += shift
         away, before = (of[:, parameter] - self.center[parameter] for of in (mean, state.mean))
-        prior = 0.5 * (before.square() - away.square()) / self.variances[parameter]
-        goes, accepted = self._move_together(places, prior)
+        rise = 0.5 * (before.square() - away.square()) / self.variances[parameter]
+        goes, accepted = self._move_together(places, rise)
         self.state = self.state._replace(mean=torch.where(goes[:, None], mean, state.mean))
         self.shift_width[parameter] *= math.exp(rate * (accepted - _ACCEPTED))
 
@@ -372,19 +372,19 @@ class _Walk:
         )
         self.stretch_width[parameter] *= math.exp(rate * (accepted - _ACCEPTED))
 
-    def _move_together(self, places: Tensor, prior: Tensor) -> tuple[Tensor, float]:
+    def _move_together(self, places: Tensor, population: Tensor) -> tuple[Tensor, float]:
         """Moves all drivers of a chain, or none.
 
         Args:
             places: where to, `(P, C, e)`.
-            prior: by how much the log density of the population rises, `(C,)`.
+            population: by how much its log density rises, `(C,)`.
 
         Returns:
             Which chains move, bool `(C,)`, and how likely they were to, in the mean.
         """
         state = self.state
         likelihood = self._likelihood(places)
-        rise = (likelihood - state.likelihood).sum(0) + prior
+        rise = (likelihood - state.likelihood).sum(0) + population
         goes = self._uniform(CHAINS).log() < rise
         self.state = state._replace(
             places=torch.where(goes[:, None], places, state.places),
