@@ -187,16 +187,16 @@ class Covered(NamedTuple):
                 digest.update(path.read_bytes())
         file = FOLDER / f"covered-{room}.json"
         if file.is_file():
-            known = json.loads(file.read_text(encoding="utf-8"))
-            if known["digest"] == digest.hexdigest():
+            saved = json.loads(file.read_text(encoding="utf-8"))
+            if saved["digest"] == digest.hexdigest():
                 by_number = {
                     module: {int(line): tests for line, tests in lines.items()}
-                    for module, lines in known["tests"].items()
+                    for module, lines in saved["tests"].items()
                 }
-                return cls(by_number, known["seconds"])
-        found = cls._measured(room)
-        file.write_text(json.dumps({"digest": digest.hexdigest(), **found._asdict()}))
-        return found
+                return cls(by_number, saved["seconds"])
+        covered = cls._measured(room)
+        file.write_text(json.dumps({"digest": digest.hexdigest(), **covered._asdict()}))
+        return covered
 
     @classmethod
     def _measured(cls, room: str) -> Covered:
@@ -224,14 +224,14 @@ class Covered(NamedTuple):
     def of(self, mutant: Mutant) -> list[str]:
         """Returns the tests that run the statement of a mutant, files with the quickest first."""
         lines = self.tests.get(mutant.module, {})
-        found: set[str] = set()
+        tests: set[str] = set()
         for line in _statement(TREE / mutant.module, mutant.line):
-            found.update(lines.get(line, ()))
+            tests.update(lines.get(line, ()))
         files: dict[str, float] = {}
-        for test in found:
+        for test in tests:
             file = test.partition("::")[0]
             files[file] = min(files.get(file, math.inf), self.seconds[test])
-        return sorted(found, key=lambda test: (files[test.partition("::")[0]], test))
+        return sorted(tests, key=lambda test: (files[test.partition("::")[0]], test))
 
 
 def _statement(path: Path, line: int) -> range:

@@ -12,12 +12,7 @@ import torch
 from cfx_forecasts.traffic.edie import STRIP_S, region, strips_of
 from cfx_forecasts.traffic.summary import binned, common_variation, flow_errors
 from cfx_forecasts.traffic.tables import STRIP_COLUMNS
-
-DT = 0.5
-
-
-def times(seconds: float = 300.0) -> torch.Tensor:
-    return DT * torch.arange(round(seconds / DT) + 1, dtype=torch.float64)
+from tests.evaluation.test_waves import DT, times
 
 
 def test_a_strip_has_edies_density_and_flow() -> None:
