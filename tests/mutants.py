@@ -10,9 +10,10 @@ that run its lines (coverage.py), files with the quickest first; where no test d
 with what is run on import, the whole room. The first failure kills it, as does a run of more than
 three times as long as without a change.
 
-Verdicts are kept in `.mutants/verdicts.jsonl`, by the content of what was changed: a run that
-was interrupted goes on, and a mutant of a file that has changed since is tried again. The table of
-survivors lists each with its line before and after. Some cannot be noticed: a bound of memory, a
+Verdicts are kept in `.mutants/verdicts.jsonl`, by the content of what was changed and, of
+survivors, of their room's tests: a run that was interrupted goes on, a mutant of a file that has
+changed since is tried again, and so is a survivor when a test has. The table of survivors lists
+each with its line before and after. Some cannot be noticed: a bound of memory, a
 number of things done at once, a digit beyond rounding. The others want a test.
 """
 
@@ -181,21 +182,18 @@ class Covered(NamedTuple):
         Raises:
             SystemExit: they fail.
         """
-        digest = hashlib.sha256()
-        for folder in ("cfx", f"tests/{room}"):
-            for path in sorted((TREE / folder).rglob("*.py")):
-                digest.update(path.read_bytes())
+        digest = digest_of("cfx", f"tests/{room}")
         file = FOLDER / f"covered-{room}.json"
         if file.is_file():
             saved = json.loads(file.read_text(encoding="utf-8"))
-            if saved["digest"] == digest.hexdigest():
+            if saved["digest"] == digest:
                 by_number = {
                     module: {int(line): tests for line, tests in lines.items()}
                     for module, lines in saved["tests"].items()
                 }
                 return cls(by_number, saved["seconds"])
         covered = cls._measured(room)
-        file.write_text(json.dumps({"digest": digest.hexdigest(), **covered._asdict()}))
+        file.write_text(json.dumps({"digest": digest, **covered._asdict()}))
         return covered
 
     @classmethod
@@ -305,28 +303,52 @@ def _first_difference(before: list[str], after: list[str]) -> tuple[str, str]:
     return "", ""
 
 
-def key_of(mutant: Mutant) -> str:
-    """Returns what a verdict belongs to: the mutant, in a file of this content."""
-    content = (TREE / mutant.module).read_bytes()
-    named = f"{mutant.module} {mutant.operator} {mutant.occurrence} ".encode()
-    return hashlib.sha256(named + content).hexdigest()
+def digest_of(*folders: str) -> str:
+    """Returns a digest of the Python files in folders of the copy."""
+    digest = hashlib.sha256()
+    for folder in folders:
+        for path in sorted((TREE / folder).rglob("*.py")):
+            digest.update(path.read_bytes())
+    return digest.hexdigest()
 
 
-def kept() -> dict[str, Verdict]:
-    """Returns the verdicts of earlier runs."""
-    file = FOLDER / "verdicts.jsonl"
-    verdicts = {}
-    if file.is_file():
-        for line in file.read_text(encoding="utf-8").splitlines():
-            key, *verdict = json.loads(line)
-            verdicts[key] = Verdict(*verdict)
-    return verdicts
+class Verdicts:
+    """The verdicts of earlier runs, in a file.
 
+    Each has the key of its mutant in a file of its content, and the digest of the tests.
+    """
 
-def keep(key: str, verdict: Verdict) -> None:
-    """Adds a verdict to those that are kept."""
-    with (FOLDER / "verdicts.jsonl").open("a", encoding="utf-8") as file:
-        file.write(json.dumps([key, *verdict]) + "\n")
+    def __init__(self, file: Path) -> None:
+        self._file = file
+        self._verdicts: dict[str, tuple[str, Verdict]] = {}
+        if file.is_file():
+            for line in file.read_text(encoding="utf-8").splitlines():
+                key, tests, *verdict = json.loads(line)
+                self._verdicts[key] = tests, Verdict(*verdict)
+
+    def of(self, mutant: Mutant) -> Verdict | None:
+        """Returns a mutant's verdict; None: there is none, or tests changed since it survived."""
+        tests, verdict = self._verdicts.get(self._key(mutant), ("", None))
+        if verdict and verdict.outcome == "survived" and tests != self._tests(mutant):
+            return None
+        return verdict
+
+    def keep(self, mutant: Mutant, verdict: Verdict) -> None:
+        """Adds a verdict."""
+        key, tests = self._key(mutant), self._tests(mutant)
+        self._verdicts[key] = tests, verdict
+        with self._file.open("a", encoding="utf-8") as file:
+            file.write(json.dumps([key, tests, *verdict]) + "\n")
+
+    @staticmethod
+    def _key(mutant: Mutant) -> str:
+        content = (TREE / mutant.module).read_bytes()
+        named = f"{mutant.module} {mutant.operator} {mutant.occurrence} ".encode()
+        return hashlib.sha256(named + content).hexdigest()
+
+    @staticmethod
+    def _tests(mutant: Mutant) -> str:
+        return digest_of(f"tests/{mutant.room}")
 
 
 def table(verdicts: Sequence[tuple[Mutant, Verdict]]) -> str:
@@ -354,19 +376,20 @@ def main() -> None:
     os.nice(10)
     FOLDER.mkdir(parents=True, exist_ok=True)
     copy_checkout()
-    verdict_of = kept()
+    kept = Verdicts(FOLDER / "verdicts.jsonl")
     covered: dict[str, Covered] = {}
     verdicts = []
     for number, mutant in enumerate(drawn(options.rooms, options.count, options.seed), start=1):
-        key = key_of(mutant)
-        if key not in verdict_of:
+        verdict = kept.of(mutant)
+        if verdict is None:
             if mutant.room not in covered:
                 covered[mutant.room] = Covered.by(mutant.room)
-            verdict_of[key] = judged(mutant, covered[mutant.room])
-            keep(key, verdict_of[key])
-        verdicts.append((mutant, verdict_of[key]))
-        outcome = verdict_of[key].outcome
-        print(f"{number}/{options.count} {outcome}: {mutant.module}:{mutant.line}", flush=True)
+            verdict = judged(mutant, covered[mutant.room])
+            kept.keep(mutant, verdict)
+        verdicts.append((mutant, verdict))
+        print(
+            f"{number}/{options.count} {verdict.outcome}: {mutant.module}:{mutant.line}", flush=True
+        )
     text = table(verdicts)
     (FOLDER / "survivors.md").write_text(text + "\n", encoding="utf-8")
     print(f"\n{text}\n\nin {FOLDER / 'survivors.md'}")

@@ -47,12 +47,33 @@ def test_the_same_seed_draws_the_same_changes_of_what_runs(module: Path) -> None
         assert "strict=True" in changed, "lists of one length are as long either way"
 
 
-def test_a_verdict_is_kept_until_its_file_changes(module: Path) -> None:
-    mutant = next(mutants.drawn(["models"], 1, seed=0))
-    mutants.keep(mutants.key_of(mutant), Verdict("killed", "a > b", "a < b"))
-    assert mutants.kept()[mutants.key_of(mutant)].outcome == "killed"
+def test_a_verdict_is_kept_until_its_file_changes_and_of_survivors_until_a_test_does(
+    module: Path,
+) -> None:
+    killed, survivor = mutants.drawn(["models"], 2, seed=0)
+    file = mutants.FOLDER / "verdicts.jsonl"
+    verdicts = mutants.Verdicts(file)
+    verdicts.keep(killed, Verdict("killed", "a > b", "a < b"))
+    verdicts.keep(survivor, Verdict("survived", "a > b", "a >= b"))
+    assert_outcomes(file, {killed: "killed", survivor: "survived"})
+
+    test = mutants.TREE / "tests" / "models" / "test_made.py"
+    test.parent.mkdir(parents=True)
+    test.write_text("def test_nothing() -> None: ...\n", encoding="utf-8")
+    assert_outcomes(file, {killed: "killed", survivor: None})
+
     module.write_text(SOURCE + "\n\nMORE = 1\n", encoding="utf-8")
-    assert mutants.key_of(mutant) not in mutants.kept()
+    assert_outcomes(file, {killed: None, survivor: None})
+
+
+def assert_outcomes(file: Path, outcomes: dict[Mutant, str | None]) -> None:
+    """Checks what is read again of mutants."""
+    verdicts = mutants.Verdicts(file)
+    read = {}
+    for mutant in outcomes:
+        verdict = verdicts.of(mutant)
+        read[mutant] = verdict.outcome if verdict else None
+    assert read == outcomes
 
 
 def test_survivors_stand_in_the_table() -> None:

@@ -203,7 +203,7 @@ class ShadeSearch(Optimizer):
         last_population = searched.points.flatten(1, 2)
         best = searched.best.gather(1, order[..., None].expand(-1, -1, n))[:, :2]
         tried = [first, last_population]
-        found = [losses, searched_losses]
+        tried_losses = [losses, searched_losses]
         # What problems without a long search return in its place: their best candidate.
         later = best[:, :1].repeat(1, plan.kept, 1)
         later_losses = ends[:, :1].repeat(1, plan.kept)
@@ -226,8 +226,8 @@ class ShadeSearch(Optimizer):
             chosen = candidates.gather(1, order[..., None].expand(-1, -1, n))
             last[open_], last_losses[open_] = chosen[:, :2], lowest[:, :2]
         tried += [later, last]
-        found += [later_losses, last_losses]
-        return tuple(tried), torch.cat(found, dim=1)
+        tried_losses += [later_losses, last_losses]
+        return tuple(tried), torch.cat(tried_losses, dim=1)
 
     def _long(
         self, objective: CandidateLosses, points: Tensor, problems: int, seed: int, plan: _Plan

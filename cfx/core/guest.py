@@ -231,9 +231,9 @@ def _logging() -> Any:
         if isinstance(logger, logging.Logger):
             loggers.append(logger)
     parts = []
-    for one in loggers:
-        flags = (one.level, one.disabled, one.propagate)
-        parts.append((one, one.handlers[:], one.filters[:], flags))
+    for logger in loggers:
+        flags = (logger.level, logger.disabled, logger.propagate)
+        parts.append((logger, logger.handlers[:], logger.filters[:], flags))
     return logging.getLogger().manager.disable, parts
 
 

@@ -34,7 +34,7 @@ from cfx.simulation.trajectory import Start
 
 
 @dataclass(frozen=True)
-class OwnParameters:
+class ParametersBeside:
     """Constant parameters of P drivers that drive beside an agent (`cfx.models.composed`).
 
     They drive the model as the agent does: with its residual, if it has one, they start with the
@@ -48,9 +48,9 @@ class OwnParameters:
     values: Tensor
     weight: Tensor
 
-    def __getitem__(self, index: Tensor) -> OwnParameters:
+    def __getitem__(self, index: Tensor) -> ParametersBeside:
         """Selects drivers by their numbers."""
-        return OwnParameters(self.values[index], self.weight[index])
+        return ParametersBeside(self.values[index], self.weight[index])
 
 
 @dataclass(frozen=True)
@@ -63,14 +63,14 @@ class Followers:
         base: `(P, n)` in SI units, the drivers' base parameters; None: the agent's own base.
         history: seconds of measured history before a simulation that the agent observes, and in
             which driver features are measured; None: all there is.
-        own: constant parameters that drive beside the agent; None: it drives alone.
+        beside: constant parameters that drive beside the agent; None: it drives alone.
     """
 
     batch: PairBatch
     network: Tensor
     base: Tensor | None = None
     history: float | None = None
-    own: OwnParameters | None = None
+    beside: ParametersBeside | None = None
 
 
 class ClosedLoop(NamedTuple):
@@ -123,7 +123,7 @@ def simulate_closed_loop(
     """
     stepper = agent.stepper(stepper)
     model = stepper.model
-    if followers.own is not None:
+    if followers.beside is not None:
         stepper = stepper.for_model(Combined(model, model))
     if state is None:
         state = burnt_in(agent, followers, first, stepper.dt)
@@ -136,14 +136,14 @@ def simulate_closed_loop(
     beyond = torch.zeros(state.beyond.shape[1], dtype=torch.float64, device=parameters.device)
     _, _, counted = track.result()
     driver_specific: Mapping[str, Tensor] = {}
-    if followers.own is not None:
-        driver_specific = agent.space.unpack(agent.core.head.completed(followers.own.values))
+    if followers.beside is not None:
+        driver_specific = agent.space.unpack(agent.core.head.completed(followers.beside.values))
     for begin in range(0, track.steps, agent.windows.stride):
         end = min(begin + agent.windows.stride, track.steps)
         chosen, state = agent.act(track.history(begin), state, generator)
         p = agent.space.unpack(chosen)
-        if followers.own is not None:
-            p = for_both(p, driver_specific, followers.own.weight)
+        if followers.beside is not None:
+            p = for_both(p, driver_specific, followers.beside.weight)
         follower, positions, speeds = stepper.advance(follower, track.leader(begin, end), p)
         track.write(begin, end, positions.T, speeds.T, stepper.dt)
         simulated = slice(begin + 1, end + 1)
@@ -345,9 +345,9 @@ def _cut(whole: ClosedLoopShard) -> Iterator[ClosedLoopShard]:
             agent = agent.only(used)
         if followers.base is not None:
             base = followers.base[part]
-        own_parameters = None if followers.own is None else followers.own[part]
+        beside = None if followers.beside is None else followers.beside[part]
         followers_of_shard = Followers(
-            followers.batch[part].trimmed(), network, base, followers.history, own_parameters
+            followers.batch[part].trimmed(), network, base, followers.history, beside
         )
         yield ClosedLoopShard(whole.stepper, agent, followers_of_shard, whole.first[part])
 

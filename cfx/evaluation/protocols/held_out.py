@@ -113,7 +113,7 @@ class HeldOut:
         for name, agent in methods.items():
             followers = self._followers(rule.history_s)
             if name == "policy" and self.combines:
-                followers = replace(followers, own=self.past.together_with(self.driver_specific))
+                followers = replace(followers, beside=self.past.together_with(self.driver_specific))
             loops[name] = context.simulated(agent, followers, self.first)
         loops["driver_specific"] = self._constant(self.driver_specific)
         if self.base is not None and self.policy.base is not None and rule.shrinkage > 0:

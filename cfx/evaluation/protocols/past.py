@@ -2,11 +2,11 @@
 
 The past of each driver, up to the test part, is split once more. On the first 60 % of it
 driver-specific parameters are calibrated, and the policy observes it; the rest is simulated with
-each of the two, and neither has seen it. Of the errors of speed e_own(t) and e_policy(t) there
+each of the two, and neither has seen it. Of the errors of speed e_constant(t) and e_policy(t) there
 follows the policy's share where both drive together (`cfx.models.composed`): that of the mean which
 errs least, and not far from a half,
 
-    minimise over w   sum (w e_policy + (1 - w) e_own)^2 + S (w - 1/2)^2
+    minimise over w   sum (w e_policy + (1 - w) e_constant)^2 + S (w - 1/2)^2
 
 with S the mean of the two sums of squares. Without correlation that lies between a half and the
 weight of J. M. Bates and C. W. J. Granger (1969); C. W. J. Granger and R. Ramanathan (1984),
@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from cfx.data.pairs import PairBatch, PairSet
-from cfx.evaluation.closed_loop import ClosedLoop, Followers, OwnParameters
+from cfx.evaluation.closed_loop import ClosedLoop, Followers, ParametersBeside
 from cfx.evaluation.protocols.base import ProtocolContext
 from cfx.evaluation.result import Array
 from cfx.policies.agent import Agent
@@ -49,7 +49,7 @@ class PastErrors:
     """Errors of speed over the last part of D drivers' pasts; NaN where the past is too short.
 
     Attributes:
-        own: mean square of parameters calibrated on the part before, which start as the policy
+        beside: mean square of parameters calibrated on the part before, which start as the policy
             does: with the driver's acceleration if its head has a residual, `(D,)`, m2/s2.
         policy: of the policy that has observed the part before, `(D,)`, m2/s2.
         product: mean product of the two errors, `(D,)`, m2/s2.
@@ -57,7 +57,7 @@ class PastErrors:
             `driver_specific`.
     """
 
-    own: Array
+    beside: Array
     policy: Array
     product: Array
     driver_specific: Array
@@ -65,9 +65,9 @@ class PastErrors:
     @property
     def weight(self) -> Array:
         """The policy's share, `(D,)`; 1 where the past says nothing."""
-        pull = (self.own + self.policy) / 2.0
-        apart = self.own + self.policy - 2.0 * self.product + pull
-        best = self.own - self.product + pull / 2.0
+        pull = (self.beside + self.policy) / 2.0
+        apart = self.beside + self.policy - 2.0 * self.product + pull
+        best = self.beside - self.product + pull / 2.0
         share = np.divide(best, apart, out=np.full_like(apart, 0.5), where=apart != 0)
         return np.where(np.isfinite(apart), share.clip(0.0, 1.0), 1.0)
 
@@ -75,17 +75,17 @@ class PastErrors:
     def both(self) -> Array:
         """RMSE of the weighted mean of the two simulations, `(D,)`, m/s."""
         weight = self.weight
-        squares = weight**2 * self.policy + (1.0 - weight) ** 2 * self.own
+        squares = weight**2 * self.policy + (1.0 - weight) ** 2 * self.beside
         squared_error = squares + 2.0 * weight * (1.0 - weight) * self.product
         return np.sqrt(np.maximum(squared_error, 0.0))
 
-    def together_with(self, values: Tensor) -> OwnParameters:
+    def together_with(self, values: Tensor) -> ParametersBeside:
         """Returns the driver-specific parameters that drive beside the policy.
 
         Args:
             values: calibrated on all of the past, `(D, n)`, SI units.
         """
-        return OwnParameters(values, torch.as_tensor(self.weight).to(values))
+        return ParametersBeside(values, torch.as_tensor(self.weight).to(values))
 
 
 def past_errors(

@@ -138,8 +138,8 @@ def never_leaves_the_bounds(optimizer: Optimizer) -> None:
             raise AssertionError(
                 f"{error}: a model would drive with parameters outside its bounds"
             ) from error
-        for asked in [*problems.asked, solution.best]:
-            inside = bool(((asked >= 0) & (asked <= 1)).all())
+        for candidates in [*problems.asked, solution.best]:
+            inside = bool(((candidates >= 0) & (candidates <= 1)).all())
             assert inside, (
                 "a candidate lies outside [0, 1]: a model would drive with parameters outside its"
                 " bounds"
@@ -220,14 +220,14 @@ def the_same_seed_gives_the_same_result(optimizer: Optimizer) -> None:
 
 
 def another_seed_searches_elsewhere(optimizer: Optimizer) -> None:
-    asked = []
+    by_seed = []
     for seed in (0, 7):
         problems = Problems(rugged, _random(3, 2, seed=5))
         _solve(optimizer, problems, n=2, seed=seed)
-        asked.append(torch.cat([candidates.flatten() for candidates in problems.asked]))
+        by_seed.append(torch.cat([candidates.flatten() for candidates in problems.asked]))
     if optimizer.evaluations(3) == 1:
         raise NotApplicable("only the first guess is evaluated")
-    assert not torch.equal(*asked), (
+    assert not torch.equal(*by_seed), (
         "seeds 0 and 7 asked for the same candidates: `seed` must reach the search, or repeating a"
         " study with other seeds shows less variation than there is"
     )
@@ -261,7 +261,7 @@ def evaluates_exactly_what_it_says(optimizer: Optimizer) -> None:
     problems, guesses = Problems(distance, _random(3, 2, seed=5)), _random(3, 2, 2, seed=6)
     done: list[int] = []
     optimizer.minimize(problems, guesses, seed=1, progress=done.append)
-    count = sum(asked.shape[0] * asked.shape[1] for asked in problems.asked)
+    count = sum(candidates.shape[0] * candidates.shape[1] for candidates in problems.asked)
     assert 3 * optimizer.returned(2) <= count <= 3 * optimizer.evaluations(2), (
         "evaluations(n) is the budget of comparisons: a search may end early, and evaluates what it"
         " returns"
@@ -270,7 +270,7 @@ def evaluates_exactly_what_it_says(optimizer: Optimizer) -> None:
         "progress must sum to problems times evaluations: users wait by it"
     )
     # A search that goes on with some of the problems has evaluated the guesses of all before.
-    together = [asked for asked in problems.asked if len(asked) == problems.problems]
+    together = [candidates for candidates in problems.asked if len(candidates) == problems.problems]
     for k in range(2):
         tried = (torch.cat(together, dim=1) == guesses[:, k : k + 1]).all(dim=-1).any(dim=1)
         assert bool(tried.all()), (

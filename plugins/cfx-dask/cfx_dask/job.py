@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.singleton import Singleton
@@ -46,7 +45,7 @@ def run_one(job: SweepJob, report: Callable[[int], None]) -> JobReturn:
             config.hydra.job.id = f"{config.hydra.job.name}_{job.number}"
             config.hydra.job.num = job.number
         HydraConfig.instance().set_config(config)
-        found: Any = run_job(
+        ended: JobReturn = run_job(
             hydra_context=job.context,
             task_function=job.function,
             config=config,
@@ -54,5 +53,4 @@ def run_one(job: SweepJob, report: Callable[[int], None]) -> JobReturn:
             job_subdir_key="hydra.sweep.subdir",
         )
     report(1)
-    ended: JobReturn = found
     return ended

@@ -45,14 +45,14 @@ class ForecastsSection(Section):
 <p>{{ caption("forecasts") }} In the tables, the smaller line below is its 95 % interval
 over drivers. Origins of one driver overlap, so they are never counted as independent.</p>
 <p>Methods: {{ methods }}</p>
-{% for one in forecasts %}
+{% for block in forecasts %}
 <div class="card">
-<h3>{{ one.job.name }}</h3>
-<p>{{ one.leader }}</p>
-{{ drawn("forecasts", one.job) }}
-{{ table(one.speed) }}
-{{ table(one.position) }}
-{{ drawn("forecasts_by_history", one.job) }}
+<h3>{{ block.job.name }}</h3>
+<p>{{ block.leader }}</p>
+{{ drawn("forecasts", block.job) }}
+{{ table(block.speed) }}
+{{ table(block.position) }}
+{{ drawn("forecasts_by_history", block.job) }}
 </div>
 {% endfor %}
 """

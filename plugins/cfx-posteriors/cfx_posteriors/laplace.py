@@ -201,8 +201,8 @@ def _around(posterior: Posterior, place: Tensor) -> _Around:
     drivers, searches, d = place.shape
     logits = place[..., :n]
     shift = DIFFERENCE * torch.eye(n, dtype=place.dtype, device=place.device)
-    asked = torch.cat([logits[:, :, None], logits[:, :, None] + shift], dim=2)
-    errors = posterior.errors(asked.flatten(1, 2)).view(-1, drivers, searches, 1 + n)
+    beside = torch.cat([logits[:, :, None], logits[:, :, None] + shift], dim=2)
+    errors = posterior.errors(beside.flatten(1, 2)).view(-1, drivers, searches, 1 + n)
     middle = errors[..., 0]
     slopes = (errors[..., 1:] - errors[..., :1]) / DIFFERENCE
     products = noise.lagged_products(middle, posterior.scored, order)

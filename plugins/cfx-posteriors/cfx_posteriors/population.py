@@ -282,10 +282,10 @@ class _Walk:
         state, drivers = self.state, len(self.samples)
         which = self._numbers(self.samples.shape[1], drivers, CHAINS * _AMONG)
         shape = (drivers, CHAINS, _AMONG)
-        own = self.prior.log_density(state.places[..., : len(self.center)])
+        prior_here = self.prior.log_density(state.places[..., : len(self.center)])
         places = _before(state.places, self._samples(which).view(*shape, -1))
         likelihood = _before(state.likelihood, self.of_samples.gather(1, which).view(shape))
-        of_prior = _before(own, self.of_prior.gather(1, which).view(shape))
+        of_prior = _before(prior_here, self.of_prior.gather(1, which).view(shape))
         density = self._density(places.transpose(1, 2)).transpose(1, 2)
         shares = (density - of_prior).softmax(dim=-1).cumsum(dim=-1)
         chosen = torch.searchsorted(shares, self._uniform(drivers, CHAINS, 1)).clamp(max=_AMONG)
@@ -396,7 +396,7 @@ class _Walk:
         """Returns the log likelihood of coordinates `(P, C, e)`, `(P, C)`."""
         sizes = [part.segments.problems for part in self.parts]
         of_parts = zip(self.parts, torch.split(places, sizes), strict=True)
-        return torch.cat([part.likelihood(own) for part, own in of_parts])
+        return torch.cat([part.likelihood(place) for part, place in of_parts])
 
     def _density(self, places: Tensor) -> Tensor:
         """Returns the log density of coordinates `(P, ..., C, e)` in the populations.

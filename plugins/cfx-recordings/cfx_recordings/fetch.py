@@ -136,7 +136,7 @@ class Service:
             DataError: the service cannot be reached, or has not sent the page whole after three
                 attempts.
         """
-        asked = {
+        parameters = {
             "$select": ",".join(query.columns).lower(),
             "$where": query.where,
             "$order": ":id",
@@ -145,7 +145,7 @@ class Service:
         }
         received = 0
         for _ in range(_TRIES):
-            text = self._get(asked)
+            text = self._get(parameters)
             table = _table(text)
             if not _has_columns(table, query.columns):
                 raise self._nonsense("the data set's columns", table)
@@ -161,9 +161,9 @@ class Service:
         """Closes its connections."""
         self._session.close()
 
-    def _get(self, asked: dict[str, str]) -> str:
+    def _get(self, parameters: dict[str, str]) -> str:
         """Returns the service's answer to a query; raises DataError where it gives none."""
-        answer = self._answer(asked)
+        answer = self._answer(parameters)
         if answer.status_code in _BUSY:
             raise self._unreachable(
                 f"it answers {answer.status_code} {answer.reason}, again and again"
@@ -175,14 +175,14 @@ class Service:
             )
         return answer.content.decode("utf-8-sig", errors="replace")
 
-    def _answer(self, asked: dict[str, str]) -> Response:
+    def _answer(self, parameters: dict[str, str]) -> Response:
         """Asks, and asks again if the connection breaks in the middle of a page."""
         from requests import RequestException
         from requests.exceptions import ChunkedEncodingError, ContentDecodingError
 
         for attempt in range(1, _TRIES + 1):
             try:
-                return self._session.get(self.url, params=asked, timeout=_TIMEOUTS)
+                return self._session.get(self.url, params=parameters, timeout=_TIMEOUTS)
             except (ChunkedEncodingError, ContentDecodingError) as error:
                 if attempt == _TRIES:
                     raise self._unreachable(_reason(error)) from None

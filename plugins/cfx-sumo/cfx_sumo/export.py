@@ -315,4 +315,4 @@ def _texts(value: Tensor | str, count: int) -> list[str]:
     """Returns an attribute of each of `count` vehicles."""
     if isinstance(value, str):
         return [value] * count
-    return [repr(float(one)) for one in value.expand(count)]
+    return [repr(float(number)) for number in value.expand(count)]

@@ -155,8 +155,10 @@ def _tracks(rows: FcdRows, settings: SumoFcdSettings) -> Tracks:
     if bool(np.isnan(rows.numbers["leaderGap"]).all()):
         _warn_of_lengths(rows, types, settings)
     else:
-        known = {name: number + 1 for number, name in enumerate(names.tolist())}
-        named = [known.get(name, tracks.NOBODY) for name in rows.texts["leaderID"][order].tolist()]
+        number_of = {name: number + 1 for number, name in enumerate(names.tolist())}
+        named = [
+            number_of.get(name, tracks.NOBODY) for name in rows.texts["leaderID"][order].tolist()
+        ]
         by_name = _Ahead(np.array(named), numbers["leaderGap"][kept], length)
         remarks += statements.remarks_of(
             _said_twice(lanes, by_name, numbers["leaderSpeed"][kept], dt)
@@ -264,17 +266,17 @@ def _said_twice(
 
 def _types(rows: FcdRows) -> tuple[tuple[str, ...], Ints]:
     """Returns the vTypes, and `(N,)` which each row has; of a vehicle's own, where it came from."""
-    own = []
+    kinds = []
     for name, kind in zip(rows.texts["id"].tolist(), rows.texts["type"].tolist(), strict=True):
-        own.append(kind.removesuffix(f"@{name}"))
-    types, kind = np.unique(np.array(own), return_inverse=True)
+        kinds.append(kind.removesuffix(f"@{name}"))
+    types, kind = np.unique(np.array(kinds), return_inverse=True)
     return tuple(types.tolist()), kind
 
 
 def _warn_of_lengths(rows: FcdRows, types: tuple[str, ...], settings: SumoFcdSettings) -> None:
     """Warns of vTypes whose length is nothing but the default: their gaps may be wrong."""
-    known = _LENGTH_IS_SUMOS | set(settings.lengths or {})
-    guessed = [name for name in types if name not in known]
+    has_length = _LENGTH_IS_SUMOS | set(settings.lengths or {})
+    guessed = [name for name in types if name not in has_length]
     if guessed:
         log.warning(
             "%s does not say how long vehicles are: those of type %s count as %g m, and gaps behind"

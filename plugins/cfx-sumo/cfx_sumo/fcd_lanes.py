@@ -68,7 +68,9 @@ class Lanes:
 
     def take(self, index: NDArray[Any]) -> Self:
         """Returns the rows at an index or a mask."""
-        return replace(self, **{one.name: getattr(self, one.name)[index] for one in fields(self)})
+        return replace(
+            self, **{column.name: getattr(self, column.name)[index] for column in fields(self)}
+        )
 
     def is_followed_up(self) -> tracks.Marks:
         """Says after which rows the same vehicle goes on in the same lane in the next frame."""
@@ -161,8 +163,8 @@ class Lanes:
         if len(couples.passed) and not np.isnan(self.x + self.y + self.heading).all():
             heading = self._road_heading()
             return lambda one, other: np.abs(self._sideways(one, other, heading)) >= width
-        known = self._couple(couples.passed, couples.passing)
-        return lambda one, other: np.isin(self._couple(one, other), known)
+        couples_met = self._couple(couples.passed, couples.passing)
+        return lambda one, other: np.isin(self._couple(one, other), couples_met)
 
     def _road_heading(self) -> Floats:
         """Returns where the lane leads at each row, rad: the median heading of those near there."""
@@ -205,9 +207,9 @@ class Lanes:
             behind, ahead = behind[still], ahead[still]
             if not len(behind):
                 break
-            found = ~beside(behind, ahead)
-            leader[behind[found]] = self.vehicle[ahead[found]]
-            is_open[behind[found]] = False
+            is_next = ~beside(behind, ahead)
+            leader[behind[is_next]] = self.vehicle[ahead[is_next]]
+            is_open[behind[is_next]] = False
         return leader
 
     @cached_property
@@ -267,13 +269,13 @@ class Lanes:
         at, is_there = self.rows_of(leader)
         is_known = is_there & (self.lane[at] == self.lane)
         left = (self.position[at] - self.position - gap)[is_known]
-        own = leader[is_known]
-        order = np.lexsort((left, own))
-        starts = np.flatnonzero(tracks.changes(own[order]))
+        followed = leader[is_known]
+        order = np.lexsort((left, followed))
+        starts = np.flatnonzero(tracks.changes(followed[order]))
         sizes = np.diff(np.append(starts, len(order)))
         medians = left[order][starts + sizes // 2]
         by_vehicle = np.full(int(self.vehicle.max(initial=0)) + 1, np.nan)
-        by_vehicle[own[order][starts]] = np.where(medians > 0, np.round(medians, 1), np.nan)
+        by_vehicle[followed[order][starts]] = np.where(medians > 0, np.round(medians, 1), np.nan)
         measured = by_vehicle[self.vehicle]
         return np.where(np.isnan(measured), default, measured)
 

@@ -233,8 +233,8 @@ def _root(path: Path) -> str:
         with open_text(path) as file, unpacking(path):
             while block := file.read(_BLOCK):
                 parser.Parse(block)
-    except _Root as found:
-        return str(found.args[0])
+    except _Root as root:
+        return str(root.args[0])
     except expat.ExpatError:
         pass
     return ""

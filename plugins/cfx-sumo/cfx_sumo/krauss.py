@@ -95,11 +95,11 @@ class KraussSumo(DrivingModel):
         )
 
     def sumo_vtype(self, p: Mapping[str, Tensor]) -> VType:
-        own = {
+        attributes = {
             name: p[name]
             for name in ("tau", "accel", "decel", "minGap", "maxSpeed", "emergencyDecel")
         }
-        return VType("Krauss", own, leader={"decel": p["decel_leader"]})
+        return VType("Krauss", attributes, leader={"decel": p["decel_leader"]})
 
 
 def _stopping(speed: Tensor, drop: Tensor, dt: float) -> Tensor:

@@ -88,15 +88,16 @@ class SumoVType(DrivingModel):
     def __init__(self, settings: Settings | None = None, **options: object) -> None:
         super().__init__(settings, **options)
         described = []
-        for one in self.space:
-            unit = _UNITS.get(one.name, "SUMO's unit")
-            described.append(replace(one, unit=unit, meaning=f"SUMO's {one.name}"))
+        for parameter in self.space:
+            unit = _UNITS.get(parameter.name, "SUMO's unit")
+            described.append(replace(parameter, unit=unit, meaning=f"SUMO's {parameter.name}"))
         self.space = ParameterSpace(tuple(described))
         attributes = self.settings.attributes or {}
-        for one in self.space:
-            if one.name in attributes:
+        for parameter in self.space:
+            if parameter.name in attributes:
                 raise ConfigError(
-                    f"model.attributes.{one.name}: it is among model.parameters too; give it once"
+                    f"model.attributes.{parameter.name}: it is among model.parameters too; give it"
+                    " once"
                 )
 
     def next_speed(

@@ -99,13 +99,13 @@ class CmaOptimizer(Optimizer):
         ]
         left = self.settings.samples - self._initial
         while left > 0:
-            asked = np.stack([search.ask() for search in searches])[:, :left]
-            candidates.append(torch.from_numpy(asked).to(guesses.device))
+            generation = np.stack([search.ask() for search in searches])[:, :left]
+            candidates.append(torch.from_numpy(generation).to(guesses.device))
             losses.append(objective(candidates[-1]))
             if left > size:
                 for search, loss in zip(searches, losses[-1].cpu().numpy(), strict=True):
                     search.tell(loss)
-            left -= asked.shape[1]
+            left -= generation.shape[1]
         return torch.cat(candidates, dim=1), torch.cat(losses, dim=1)
 
     @property

@@ -132,10 +132,10 @@ class DifferentialEvolution(Optimizer):
         losses = [objective(candidates[0])]
         searches = [_Search(start, self.settings, seed) for start in candidates[0].cpu().numpy()]
         for _ in range(self.settings.generations):
-            asked = []
+            generation = []
             for search, loss in zip(searches, losses[-1].cpu().numpy(), strict=True):
-                asked.append(search.tell(loss))
-            candidates.append(torch.from_numpy(np.stack(asked)).to(guesses.device))
+                generation.append(search.tell(loss))
+            candidates.append(torch.from_numpy(np.stack(generation)).to(guesses.device))
             losses.append(objective(candidates[-1]))
         return torch.cat(candidates, dim=1), torch.cat(losses, dim=1)
 
@@ -158,8 +158,8 @@ class _Search:
         Returns:
             `(size, n)` within [0, 1].
         """
-        asked: Floats = self._solver.switch(np.clip(losses, -_LARGEST, _LARGEST))
-        return np.clip(asked, 0.0, 1.0)
+        generation: Floats = self._solver.switch(np.clip(losses, -_LARGEST, _LARGEST))
+        return np.clip(generation, 0.0, 1.0)
 
     def _solve(self) -> Floats:
         from scipy.optimize import Bounds, differential_evolution

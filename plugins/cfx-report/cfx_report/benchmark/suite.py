@@ -169,10 +169,10 @@ class Suite:
         for task in self.tasks:
             if task.name == name:
                 return task
-        known = [task.name for task in self.tasks]
+        names = [task.name for task in self.tasks]
         raise DataError(
-            f"task '{name}': {self.version} has no such task.{nearest(name, known)} Known:"
-            f" {', '.join(known)}"
+            f"task '{name}': {self.version} has no such task.{nearest(name, names)} Known:"
+            f" {', '.join(names)}"
         )
 
     def tasks_of(self, scheme: Scheme) -> list[Task]:

@@ -105,8 +105,8 @@ class LaggedRival(Rival):
                 steps = round(horizon / pair.dt)
                 inside = moments[moments + steps < len(pair)]
                 speed, leader = np.asarray(pair.follower_speed), np.asarray(pair.leader_speed)
-                known = _future(leader, inside, horizon, pair.dt)
-                inputs.append(np.hstack([_states(pair, inside, FORECAST_LAGS_S), known]))
+                future = _future(leader, inside, horizon, pair.dt)
+                inputs.append(np.hstack([_states(pair, inside, FORECAST_LAGS_S), future]))
                 changes.append(speed[inside + steps] - speed[inside])
             ends.append(_fitted(self.regression(seed), inputs, changes))
         return ends
@@ -147,8 +147,8 @@ class LaggedDriver(StepDriver):
         leader = batch.leader_speed.numpy()
         knots = [speed]
         for horizon, model in zip(HORIZONS_S, self._ends, strict=True):
-            known = _future_of_each(leader, rows, first.numpy(), horizon, batch.dt)
-            change = np.asarray(model.predict(np.hstack([states, known])))
+            future = _future_of_each(leader, rows, first.numpy(), horizon, batch.dt)
+            change = np.asarray(model.predict(np.hstack([states, future])))
             knots.append(np.maximum(speed + change, 0.0))
         return torch.as_tensor(between_horizons(np.stack(knots, 1), batch, first))[None]
 

@@ -153,18 +153,18 @@ def _covariances(pairs: PairSet, idm: _Idm, remembered: int) -> Floats:
     usable = counted.numpy() & (batch.gap[:, ::every][:, :-1] > 0.0).numpy()
     residual = np.where(usable, residual, 0.0)
     sites = np.array([pair.site for pair in pairs])
-    found = []
+    of_sites = []
     for site in np.unique(sites):
         rows = sites == site
-        values, known = residual[rows], usable[rows]
+        values, is_known = residual[rows], usable[rows]
         sums = []
         for lag in range(remembered + 1):
-            both = known[:, lag:] & known[:, : known.shape[1] - lag]
+            both = is_known[:, lag:] & is_known[:, : is_known.shape[1] - lag]
             product = values[:, lag:] * values[:, : values.shape[1] - lag]
             # Divided by the same number at each lag, so that the matrix of them is positive.
-            sums.append(float(product[both].sum()) / float(known.sum()))
-        found.append(sums)
-    each = np.array(found)
+            sums.append(float(product[both].sum()) / float(is_known.sum()))
+        of_sites.append(sums)
+    each = np.array(of_sites)
     correlations: Floats = (each / each[:, :1]).mean(0)
     return correlations * float(np.median(each[:, 0]))
 

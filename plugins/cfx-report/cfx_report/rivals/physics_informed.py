@@ -53,7 +53,11 @@ class PhysicsInformed(Rival):
         s = self.settings
         states, actions, weights = _moments(pairs)
         model = cast(DrivingModel, registry.create("model", {"name": "idm"}))
-        bounds = torch.tensor([[one.low, one.high] for one in model.space.tuned]).double().T
+        bounds = (
+            torch.tensor([[parameter.low, parameter.high] for parameter in model.space.tuned])
+            .double()
+            .T
+        )
         with torch.random.fork_rng(devices=[]), threads.one_thread():
             torch.manual_seed(seed)
             module = nn.Sequential(

@@ -104,18 +104,18 @@ class Forecasts(NamedTuple):
             ConfigError: no pair lasts as long as a past and the longest horizon.
         """
         driving = np.array([mean_error(driver, pairs) for driver in drivers])
-        asked = moments(list(pairs), _PAST_S, _EVERY_S, HORIZONS_S[-1])
-        if not len(asked):
+        segments = moments(list(pairs), _PAST_S, _EVERY_S, HORIZONS_S[-1])
+        if not len(segments):
             raise ConfigError(
                 f"rival=stacked: no pair of a half of the sites lasts {_PAST_S + HORIZONS_S[-1]:g}"
                 " s; give longer recordings"
             )
-        batch = asked.batch()
-        now = _at(batch.follower_speed, asked.first, batch.dt, (0.0,))
-        measured = _at(batch.follower_speed, asked.first, batch.dt, HORIZONS_S)
-        predicted = _predicted(drivers, asked.blanked(), asked.first)
-        even = _evenness(asked, measured - now)
-        situations = _situation(batch, asked.first)
+        batch = segments.batch()
+        now = _at(batch.follower_speed, segments.first, batch.dt, (0.0,))
+        measured = _at(batch.follower_speed, segments.first, batch.dt, HORIZONS_S)
+        predicted = _predicted(drivers, segments.blanked(), segments.first)
+        even = _evenness(segments, measured - now)
+        situations = _situation(batch, segments.first)
         return cls(now, predicted, measured, even, situations, driving)
 
     @classmethod
@@ -228,12 +228,12 @@ def _mixed(weights: Floats, predicted: Floats, now: Floats) -> Floats:
     return mixed
 
 
-def _evenness(asked: Segments, changes: Floats) -> Floats:
+def _evenness(segments: Segments, changes: Floats) -> Floats:
     """Returns the roots of the weights of moments, `(Q, H)`: each site counts as another.
 
     Squares are divided by what speeds change there, so that a motorway is not all that counts.
     """
-    sites = np.array([pair.site for pair in asked.pairs])
+    sites = np.array([pair.site for pair in segments.pairs])
     roots = np.empty_like(changes)
     for site in np.unique(sites):
         rows = sites == site

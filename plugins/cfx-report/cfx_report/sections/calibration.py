@@ -28,22 +28,22 @@ class CalibrationSection(Section):
     order = 1400
     template = """
 <p>{{ caption("calibration") }}</p>
-{% for one in calibrations %}
-{% call fold(one.names, loop.first, "job") %}
-{{ drawn("calibration", one.job) }}
-{{ table(one.sheet, explain=loop.first) }}
+{% for calibration in calibrations %}
+{% call fold(calibration.names, loop.first, "job") %}
+{{ drawn("calibration", calibration.job) }}
+{{ table(calibration.sheet, explain=loop.first) }}
 {% for name in ("identifiability", "posterior_intervals", "posterior_pairs", "posterior_fan",
    "fit_train_test") %}
-{% set beyond = drawn(name, one.job) %}
+{% set beyond = drawn(name, calibration.job) %}
 {% if beyond %}
 <p>{{ caption(name) }}</p>
 {{ beyond }}
 {% endif %}
 {% endfor %}
-{% if one.labels %}
+{% if calibration.labels %}
 <p>{{ caption("labels_over_time") }}</p>
-{{ figure(one.labels, "Per-window calibrated parameters over time, and how much they mattered",
-   "Pair") }}
+{{ figure(calibration.labels,
+   "Per-window calibrated parameters over time, and how much they mattered", "Pair") }}
 {% endif %}
 {% endcall %}
 {% endfor %}

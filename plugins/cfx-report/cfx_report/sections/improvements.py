@@ -213,7 +213,7 @@ def _group(name: str, pairs: pd.DataFrame, column: str) -> ClusterGroup:
 class _Row(NamedTuple):
     jobs: str
     cluster: str
-    found: Improvement
+    improvement: Improvement
 
 
 def clusters(series: Series, baseline: str) -> Sheet:
@@ -236,7 +236,7 @@ def clusters(series: Series, baseline: str) -> Sheet:
         ),
         Column(
             "Pairs",
-            lambda row: number(row.found.pairs, "d"),
+            lambda row: number(row.improvement.pairs, "d"),
             "Pairs of drivers of this cluster whose improvement is defined.",
         ),
     )

@@ -28,11 +28,11 @@ class PaperSection(Section):
 
     template = """
 <p>{{ paper.citation }}</p>
-{% for one in experiments %}
-<h3>{{ one.heading }}</h3>
-{{ table(one.sheet, sortable=false) }}
-<ul>{% for words in one.verdicts %}<li>{{ words }}</li>{% endfor %}</ul>
-<p>{{ one.differences }}</p>
+{% for experiment in experiments %}
+<h3>{{ experiment.heading }}</h3>
+{{ table(experiment.sheet, sortable=false) }}
+<ul>{% for words in experiment.verdicts %}<li>{{ words }}</li>{% endfor %}</ul>
+<p>{{ experiment.differences }}</p>
 {% endfor %}
 """
 

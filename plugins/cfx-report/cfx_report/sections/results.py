@@ -187,7 +187,7 @@ class _Compared(NamedTuple):
     job: str
     baseline: str
     scope: str
-    found: Improvement
+    improvement: Improvement
 
 
 def improvements(jobs: Sequence[Result]) -> Sheet:
@@ -227,7 +227,7 @@ def _frames(row: _Compared) -> str:
 
 
 def _p_value(row: Any) -> Cell:
-    value = row.found.p_value
+    value = row.improvement.p_value
     cell = number(value, ".2g")
     return replace(cell, text="< 0.0001") if value < 1e-4 else cell
 
@@ -385,9 +385,9 @@ measured state and covers the same frames.</p>
 {% for job, sheet in measured %}
 {% call fold(job.name, loop.first, "job") %}
 {{ table(sheet, compact=true) }}
-{% for one in job.data.get("metrics_left_out") or () %}
+{% for left_out in job.data.get("metrics_left_out") or () %}
 <p class="lacking">
-{{ one.name }} of {{ one.distribution }} could not be measured: {{ one.reason }}
+{{ left_out.name }} of {{ left_out.distribution }} could not be measured: {{ left_out.reason }}
 </p>
 {% endfor %}
 {% endcall %}

@@ -101,7 +101,7 @@ class SumoDemo(Demo):
 
 def _write_errors(path: Path, simulated: Sequence[SimulatedPair]) -> None:
     """Writes the errors of the pairs in SUMO beside those in memory."""
-    table = pd.concat([one.table for one in simulated], ignore_index=True)
+    table = pd.concat([drive.table for drive in simulated], ignore_index=True)
     with files.atomic_write(path) as partial:
         table.to_csv(partial, index=False)
     log.info(

@@ -199,14 +199,14 @@ def _stretch(net: Path, name: str) -> Motorway:
 
 def _lanes(network: Any) -> tuple[Lane, ...]:
     """Returns all lanes for cars."""
-    found = []
+    lanes = []
     for edge in network.getEdges(withInternal=True):
         for lane in edge.getLanes():
             if lane.allows("passenger"):
                 shape = np.array([point[:2] for point in lane.getShape()])
                 inner = lane.getIndex() + 1 < edge.getLaneNumber()
-                found.append(Lane(shape, float(lane.getWidth()), inner))
-    return tuple(found)
+                lanes.append(Lane(shape, float(lane.getWidth()), inner))
+    return tuple(lanes)
 
 
 _Chain = list[tuple[Any, tuple[int, ...]]]
@@ -238,13 +238,13 @@ def _onward(edge: Any, lanes: tuple[int, ...]) -> tuple[list[int], tuple[int, ..
     """Returns which lanes go on to the edge most lead to, their numbers there, that edge."""
     best: tuple[list[int], tuple[int, ...], Any] | None = None
     for target in edge.getOutgoing():
-        found: dict[int, int] = {}
+        number_of: dict[int, int] = {}
         for place, number in enumerate(lanes):
-            free = _free_lanes(edge.getLane(number), target, found.values())
+            free = _free_lanes(edge.getLane(number), target, number_of.values())
             if free:
-                found[place] = min(free)
-        if len(found) >= ABREAST and (best is None or len(found) > len(best[0])):
-            best = (list(found), tuple(found.values()), target)
+                number_of[place] = min(free)
+        if len(number_of) >= ABREAST and (best is None or len(number_of) > len(best[0])):
+            best = (list(number_of), tuple(number_of.values()), target)
     return best
 
 

@@ -60,8 +60,8 @@ def render(
     )
     scripts = inline_scripts([_asset("demo.js")])
     rows: list[Any] = []
-    for one in simulated:
-        rows += one.table.to_dict("records")
+    for drive in simulated:
+        rows += drive.table.to_dict("records")
     plots = _plots(evaluation)
     vehicles = ("leader", *FOLLOWERS)
     return environment.from_string(_asset("demo.html.j2")).render(
@@ -96,8 +96,8 @@ def _content(
     """
     corner = np.concatenate([lane.shape for lane in road.lanes]).min(axis=0)
     pairs = []
-    for one, plot in zip(simulated, plots, strict=True):
-        pairs.append(_pair(one, corner) | {"axes": plot.axes})
+    for drive, plot in zip(simulated, plots, strict=True):
+        pairs.append(_pair(drive, corner) | {"axes": plot.axes})
     lanes = []
     for lane in road.lanes:
         shape = _rounded(100 * (lane.shape - corner))
@@ -112,20 +112,20 @@ def _content(
     }
 
 
-def _pair(one: SimulatedPair, corner: Array) -> dict[str, Any]:
+def _pair(drive: SimulatedPair, corner: Array) -> dict[str, Any]:
     speed, gap, place = {}, {}, {}
     for kind in FOLLOWERS:
-        speed[kind] = _rounded(100 * one.speed[kind])
-        gap[kind] = _rounded(100 * one.gap[kind])
+        speed[kind] = _rounded(100 * drive.speed[kind])
+        gap[kind] = _rounded(100 * drive.gap[kind])
         # Centimetres and tenths of a degree.
-        position, heading = one.place[kind][..., :2], one.place[kind][..., 2:]
+        position, heading = drive.place[kind][..., :2], drive.place[kind][..., 2:]
         place[kind] = _rounded(np.concatenate([100 * (position - corner), 10 * heading], axis=-1))
     return {
-        "id": one.pair.pair_id,
-        "scene": one.scene,
-        "dt": one.pair.dt,
-        "first": one.first,
-        "leaderLength": one.pair.leader_length,
+        "id": drive.pair.pair_id,
+        "scene": drive.scene,
+        "dt": drive.pair.dt,
+        "first": drive.first,
+        "leaderLength": drive.pair.leader_length,
         "speed": speed,
         "gap": gap,
         "place": place,
@@ -153,17 +153,17 @@ def _plots(evaluation: Evaluation) -> list[_Plot]:
     from cfx_report.inline import PLACE, inline_svg
 
     result = Result.of(evaluation)
-    found = []
+    plots = []
     for k, trajectory in enumerate(evaluation.trajectories):
         figure = pair_lines.draw_pair(result, trajectory.pair_id)
         svg = inline_svg(figure).replace(PLACE, f"plot-{k}-")
         axes = []
-        for one in figure.axes:
-            box, (begin, end) = one.get_position(), one.get_xlim()
+        for panel in figure.axes:
+            box, (begin, end) = panel.get_position(), panel.get_xlim()
             numbers = (box.x0, 1 - box.y1, box.width, box.height, begin, end)
             axes.append([round(float(number), 4) for number in numbers])
-        found.append(_Plot(svg, f"Speed, gap and parameters of pair {trajectory.pair_id}", axes))
-    return found
+        plots.append(_Plot(svg, f"Speed, gap and parameters of pair {trajectory.pair_id}", axes))
+    return plots
 
 
 def _rounded(values: Array) -> list[Any]:

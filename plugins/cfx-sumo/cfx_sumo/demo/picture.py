@@ -37,9 +37,11 @@ def write_pictures(
         OutputError: a file cannot be written.
     """
     middle = simulated[len(simulated) // 2]
-    together = [one for one in simulated if one.scene == middle.scene]
+    together = [drive for drive in simulated if drive.scene == middle.scene]
     picture = drawing.write_figure(snapshots(road, middle, together), folder / "demo.png")
-    trajectories = pair_lines.drives(Result.of(evaluation), [one.pair.pair_id for one in simulated])
+    trajectories = pair_lines.drives(
+        Result.of(evaluation), [drive.pair.pair_id for drive in simulated]
+    )
     return [picture, drawing.write_figure(trajectories, folder / "demo_drives.png")]
 
 
@@ -61,8 +63,8 @@ def snapshots(road: Motorway, main: SimulatedPair, together: Sequence[SimulatedP
     for axes, frame in zip(figure.subplots(1, _MOMENTS), frames, strict=True):
         view = _View.of(main, together, int(frame), width)
         _draw_road(axes, road, view)
-        for one in together:
-            _draw_pair(axes, one, int(frame), view, named=one is main)
+        for drive in together:
+            _draw_pair(axes, drive, int(frame), view, named=drive is main)
         title = "the models take over"
         if frame > main.first:
             title = f"after {(frame - main.first) * main.pair.dt:.0f} s"

@@ -156,10 +156,10 @@ def _replay(request: ReplayRequest) -> dict[str, Array]:
     scenes: dict[int, list[int]] = {}
     for number, pair in enumerate(header["pairs"]):
         scenes.setdefault(pair["scene"], []).append(number)
-    found: dict[str, Array] = {}
+    answers: dict[str, Array] = {}
     for scene in sorted(scenes):
-        found |= _scene(libsumo, header, scenes[scene], arrays)
-    return found
+        answers |= _scene(libsumo, header, scenes[scene], arrays)
+    return answers
 
 
 def _scene(
@@ -189,13 +189,13 @@ def _scene(
             driver_features=pair["driver_features"],
         )
     _simulate(sumo, header, roads, drivers, chosen)
-    found: dict[str, Array] = {}
+    answers: dict[str, Array] = {}
     for road in roads:
-        found[f"{road.number}/{road.kind}/motion"] = road.motion
-        found[f"{road.number}/{road.kind}/place"] = road.place
+        answers[f"{road.number}/{road.kind}/motion"] = road.motion
+        answers[f"{road.number}/{road.kind}/place"] = road.place
     for number, parameters in chosen.items():
-        found[f"{number}/parameters"] = parameters
-    return found
+        answers[f"{number}/parameters"] = parameters
+    return answers
 
 
 def _simulate(

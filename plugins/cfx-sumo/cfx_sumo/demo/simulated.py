@@ -160,20 +160,20 @@ def fitting_pairs(pairs: PairSet, road: Motorway) -> dict[str, Pair]:
     Raises:
         DataError: there are none.
     """
-    found = {}
+    fitting = {}
     for pair in pairs:
         if _places(pair, road, 0) is not None:
-            found[pair.pair_id] = pair
-    if not found:
+            fitting[pair.pair_id] = pair
+    if not fitting:
         shortest = min(_travelled(pair) for pair in pairs) + _BEGIN
         raise DataError(
             f"demo.osm: the motorway has {road.length:.0f} m, the pair with the shortest way takes"
             f" {shortest:.0f} m; name an extract with a longer road, or leave demo.osm out"
         )
-    left_out = len(pairs) - len(found)
+    left_out = len(pairs) - len(fitting)
     if left_out:
         log.info("SUMO: %d pairs are not shown, as the motorway is too short for them", left_out)
-    return found
+    return fitting
 
 
 def ask(request: ReplayRequest) -> dict[str, Array]:
@@ -230,13 +230,13 @@ def _request(
 def _networks(evaluation: Evaluation, policy: Agent) -> dict[str, str]:
     """Returns which of the policy's networks each pair was evaluated with."""
     table = evaluation.table.drop_duplicates("pair_id").set_index("pair_id")
-    found = {}
+    networks = {}
     for pair_id in [trajectory.pair_id for trajectory in evaluation.trajectories]:
         candidates = [pair_id, ANY_DRIVER, policy.names[0]]
         if "fold" in table and pd.notna(table["fold"][pair_id]):
             candidates.insert(0, f"fold {int(table['fold'][pair_id])}")
-        found[pair_id] = next(name for name in candidates if name in policy.names)
-    return found
+        networks[pair_id] = next(name for name in candidates if name in policy.names)
+    return networks
 
 
 def _base(job: FinishedJob, pair_id: str) -> dict[str, float] | None:
@@ -359,20 +359,20 @@ def _simulated_pair(
 def evaluation_in_sumo(evaluation: Evaluation, simulated: Sequence[SimulatedPair]) -> Evaluation:
     """Returns a job's evaluation of the simulated pairs, with SUMO's trajectories and errors."""
     methods = FOLLOWERS[1:]
-    ids = [one.pair.pair_id for one in simulated]
+    ids = [drive.pair.pair_id for drive in simulated]
     about, values = evaluation.about, evaluation.values
     about = about[about["pair_id"].isin(ids) & about["method"].isin(methods)]
     values = values[values["pair_id"].isin(ids) & values["method"].isin(methods)].copy()
-    found = pd.concat([one.table for one in simulated]).set_index(["pair_id", "method"])
+    in_sumo = pd.concat([drive.table for drive in simulated]).set_index(["pair_id", "method"])
     for metric in ("rmse_speed", "rmse_gap"):
         rows = (values["metric"] == metric) & (values["scope"] == "test")
         places = pd.MultiIndex.from_frame(values.loc[rows, ["pair_id", "method"]])
-        values.loc[rows, "value"] = found[f"{metric}_sumo"].reindex(places).to_numpy()
+        values.loc[rows, "value"] = in_sumo[f"{metric}_sumo"].reindex(places).to_numpy()
     return replace(
         evaluation,
         about=about.reset_index(drop=True),
         values=values,
-        trajectories=tuple(_test_part(one, methods) for one in simulated),
+        trajectories=tuple(_test_part(drive, methods) for drive in simulated),
     )
 
 

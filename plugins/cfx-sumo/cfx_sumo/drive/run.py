@@ -784,7 +784,7 @@ class _Run:
         view = driver.looked_at()
         if view is not None and len(view.names) == len(names):
             looked = view.names
-            if view.arrangement.asked == names or set(looked) == set(names):
+            if view.arrangement.requested == names or set(looked) == set(names):
                 return _Motions.of_view(looked, view)
         vehicle = self._sumo.vehicle
         motions = []

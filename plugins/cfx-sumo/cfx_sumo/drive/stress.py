@@ -123,7 +123,7 @@ class StressResult:
 
     def to_json(self) -> dict[str, Any]:
         """Returns plain data."""
-        return {"events": [asdict(one) for one in self.events], "town": asdict(self.town)}
+        return {"events": [asdict(event) for event in self.events], "town": asdict(self.town)}
 
 
 def run_stress(
@@ -160,17 +160,17 @@ def run_stress(
         "standing vehicles": [_standing_vehicle(rng) for _ in range(few)],
     }
     command = _Command(step, tuple(sumo_options))
-    found = []
+    results = []
     with Task("Driving stress", len(kinds) + len(_TOWN) + 1) as task:
         for kind, events in kinds.items():
-            found.append(_run_events(kind, events, _fleet(runs, speed_mode), command))
+            results.append(_run_events(kind, events, _fleet(runs, speed_mode), command))
             task.advance()
         for kind, routes, end in _TOWN:
-            found.append(_run_town(kind, routes, end, _fleet(runs, speed_mode), command))
+            results.append(_run_town(kind, routes, end, _fleet(runs, speed_mode), command))
             task.advance()
         more, town = run_town(runs, speed_mode=speed_mode, step=step, sumo_options=sumo_options)
         task.advance()
-    return StressResult((*found, *more), town)
+    return StressResult((*results, *more), town)
 
 
 def run_town(
@@ -222,16 +222,16 @@ def report_stress(result: StressResult, output: Path | None = None) -> None:
     )
     for column in table.columns[1:]:
         column.justify = "right"
-    for one in result.events:
+    for event in result.events:
         table.add_row(
-            one.kind,
-            str(one.number),
-            _range(one.headway),
-            str(one.collisions),
-            f"{one.hardest_braking:.2f}",
-            str(one.braked_hard),
-            f"{one.hardest_acceleration:.2f}",
-            f"{one.smallest_gap:.2f}",
+            event.kind,
+            str(event.number),
+            _range(event.headway),
+            str(event.collisions),
+            f"{event.hardest_braking:.2f}",
+            str(event.braked_hard),
+            f"{event.hardest_acceleration:.2f}",
+            f"{event.smallest_gap:.2f}",
         )
     console.print_table(table)
     town = result.town

@@ -237,16 +237,16 @@ def write_traffic(report: TrafficReport, folder: Path, command: str) -> list[Pat
 def card_of(report: TrafficReport, command: str) -> dict[str, Any]:
     """Returns what stands on a policy's card, as `traffic.json` holds it."""
     rows = []
-    for one in report.measures:
+    for measure in report.measures:
         rows.append(
             {
-                "measure": one.name,
-                "meaning": one.title,
-                "step_s": one.step,
-                "value": None if np.isnan(one.value) else round(one.value, 4),
-                "text": f"{one.text} {one.unit}".strip(),
-                "usual": one.usual,
-                "outside": one.word,
+                "measure": measure.name,
+                "meaning": measure.title,
+                "step_s": measure.step,
+                "value": None if np.isnan(measure.value) else round(measure.value, 4),
+                "text": f"{measure.text} {measure.unit}".strip(),
+                "usual": measure.usual,
+                "outside": measure.word,
             }
         )
     driven, recorded = report.alone.time_gaps, report.recorded.time_gaps()
@@ -288,9 +288,11 @@ def print_traffic(report: TrafficReport) -> None:
     table = console.blank_table("traffic of " + report.run, "step [s]", "measured", "usual", "")
     for column in table.columns[1:4]:
         column.justify = "right"
-    for one in report.measures:
-        value = f"{one.text} {one.unit}".strip()
-        table.add_row(one.title, f"{one.step:g}", value, one.usual, Text(one.word, "red"))
+    for measure in report.measures:
+        value = f"{measure.text} {measure.unit}".strip()
+        table.add_row(
+            measure.title, f"{measure.step:g}", value, measure.usual, Text(measure.word, "red")
+        )
     console.print_table(table)
     print(
         f"Flows of equilibria beside those of recorded drivers ({report.recorded.of}), within"

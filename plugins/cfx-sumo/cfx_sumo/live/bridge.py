@@ -170,9 +170,9 @@ def bridge_of(vehicle: Any) -> Bridge | None:
 def _built() -> Bridge | None:
     if not hasattr(os, "RTLD_NOLOAD"):  # on Windows
         return None
-    found: Any = importlib.import_module("libsumo._libsumo")
+    module: Any = importlib.import_module("libsumo._libsumo")
     try:
-        libsumo = ctypes.CDLL(found.__file__, mode=os.RTLD_NOLOAD)
+        libsumo = ctypes.CDLL(module.__file__, mode=os.RTLD_NOLOAD)
         compiled = build_library(Path(__file__).with_suffix(".cpp").read_text(encoding="utf-8"))
         return None if compiled is None else Bridge(compiled, libsumo)
     except (AttributeError, OSError):

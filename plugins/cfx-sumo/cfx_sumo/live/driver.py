@@ -106,7 +106,7 @@ class LastDrive:
     def goes_on(self, names: list[str], now: float, clock: Clock) -> bool:
         """Says whether the same vehicles are driven one period later; a list of them is kept."""
         is_next = abs(now - self.time - clock.period) < 0.5 * clock.dt
-        return self.view is not None and is_next and self.view.arrangement.asked is names
+        return self.view is not None and is_next and self.view.arrangement.requested is names
 
     def is_arranged(self, view: View) -> bool:
         """Says whether everybody is still behind the same leader."""
@@ -558,7 +558,7 @@ class Driver:
             The rows in the view's order, `(D,)` int64, and what all vehicles do.
         """
         table, last, count = self._vehicles.table, self._last, len(view.following)
-        unchanged = last.goes_on(view.arrangement.asked, now, clock) and last.is_arranged(view)
+        unchanged = last.goes_on(view.arrangement.requested, now, clock) and last.is_arranged(view)
         rows = last.rows if unchanged else rows[view.arrangement.order]
         # Until all is done nothing is known of this call: it may end in an error.
         self._last = LastDrive()

@@ -73,9 +73,9 @@ class Fleet:
         loaded: dict[str | Path, Driver] = {}
         for run in dict.fromkeys(runs.values()):
             folder, chosen = _network_of(run, network)
-            own = options.copy()
-            own["seed"] = None if seed is None else seed + len(loaded)
-            loaded[run] = Driver.load(folder, network=chosen, **own)
+            of_driver = options.copy()
+            of_driver["seed"] = None if seed is None else seed + len(loaded)
+            loaded[run] = Driver.load(folder, network=chosen, **of_driver)
         return cls({name: loaded[run] for name, run in runs.items()})
 
     @property
@@ -116,10 +116,10 @@ class Fleet:
         """Finds the vType and the driver of each vehicle on the road."""
         types: dict[str, str] = {}
         for vehicle in ids:
-            known = self._type_of.get(vehicle)
-            if known is None or vehicle in departed:
-                known = self._name_of(connection.vehicle.getTypeID(vehicle))
-            types[vehicle] = known
+            name = self._type_of.get(vehicle)
+            if name is None or vehicle in departed:
+                name = self._name_of(connection.vehicle.getTypeID(vehicle))
+            types[vehicle] = name
         self._ids, self._type_of = ids, types
         self._driven = None
         vehicles: dict[int, list[str]] = {id(driver): [] for driver in self._each_driver()}

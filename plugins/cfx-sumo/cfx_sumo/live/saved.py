@@ -83,13 +83,13 @@ def read_state(path: Path) -> tuple[list[DriverRecord], dict[str, str]]:
         if described["format"] != _FORMAT:
             raise KeyError("format")
         records = []
-        for number, one in enumerate(described["drivers"]):
-            own = f"{number}."
+        for number, driver in enumerate(described["drivers"]):
+            prefix = f"{number}."
             rows = {}
             for name, column in tensors.items():
-                if name.startswith(own):
-                    rows[name.removeprefix(own)] = column
-            records.append(DriverRecord(one, rows))
+                if name.startswith(prefix):
+                    rows[name.removeprefix(prefix)] = column
+            records.append(DriverRecord(driver, rows))
         return records, dict(described["types"])
     except (SafetensorError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise DataError(

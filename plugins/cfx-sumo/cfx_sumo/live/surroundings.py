@@ -83,7 +83,7 @@ class Arrangement(NamedTuple):
     """Who is ahead of whom; mostly the same as an instant ago.
 
     Attributes:
-        asked: the D vehicles that were asked for.
+        requested: the D vehicles that were asked for.
         read: what was read of them as they were arranged so.
         following: those with a leader, F of them.
         leaders: their leaders.
@@ -93,7 +93,7 @@ class Arrangement(NamedTuple):
         order: which of the vehicles that were asked for each is, `(D,)` int64.
     """
 
-    asked: list[str]
+    requested: list[str]
     read: Read
     following: list[str]
     leaders: list[str]
@@ -117,7 +117,7 @@ class Arrangement(NamedTuple):
         is_among = read.follows & (read.at >= 0)
         among = np.where(is_among, place.take(read.at, mode="clip"), _ANOTHER)[order]
         return cls(
-            asked=names,
+            requested=names,
             read=read,
             following=following,
             leaders=ahead[order[:count]].tolist(),
@@ -128,7 +128,7 @@ class Arrangement(NamedTuple):
 
     def is_still(self, names: list[str], read: Read) -> bool:
         """Says whether vehicles are arranged like this."""
-        if self.asked != names or self.read.others != read.others:
+        if self.requested != names or self.read.others != read.others:
             return False
         return read.unchanged or (
             np.array_equal(self.read.at, read.at)
@@ -178,11 +178,11 @@ class View(NamedTuple):
             others: of vehicles that other drivers drive, by their ids.
         """
         rows = self.arrangement.rows
-        known = torch.where(rows < 0, torch.nan, speed[rows])
+        speeds = torch.where(rows < 0, torch.nan, speed[rows])
         if others:
             for row in (rows[: len(self.leaders)] < 0).nonzero().flatten().tolist():
-                known[row] = others.get(self.leaders[row], torch.nan)
-        return known
+                speeds[row] = others.get(self.leaders[row], torch.nan)
+        return speeds
 
 
 def look(
@@ -205,7 +205,7 @@ def look(
     bridge = bridge_of(vehicle)
     if bridge is not None:
         last = None if before is None else before.arrangement
-        is_same = last is not None and last.asked == names
+        is_same = last is not None and last.requested == names
         read = bridge.read(
             names, look_ahead, FREE_ROAD_M, last.read if last is not None and is_same else None
         )
@@ -349,9 +349,9 @@ class SubscribedReader:
 
     def row(self, name: str) -> _Row:
         """Returns what SUMO says of a vehicle."""
-        own = self._values(name, _LEADER)
-        motion = own[_SPEED], own[_ACCELERATION]
-        return (own[_LEADER], *motion, own[_MIN_GAP], own[_ALLOWED_SPEED])
+        row = self._values(name, _LEADER)
+        motion = row[_SPEED], row[_ACCELERATION]
+        return (row[_LEADER], *motion, row[_MIN_GAP], row[_ALLOWED_SPEED])
 
     def motion(self, name: str) -> tuple[float, float]:
         """Returns a vehicle's speed, m/s, and acceleration, m/s2."""

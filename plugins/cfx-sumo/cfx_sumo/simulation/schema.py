@@ -46,19 +46,19 @@ def check_vtype(kind: VType) -> None:
         ConfigError: it does not; names the nearest that it knows.
         SumoError: SUMO's schema is not there.
     """
-    known = car_following()
+    attributes_of = car_following()
     name = kind.car_follow_model
-    if name not in known:
+    if name not in attributes_of:
         raise ConfigError(
             f"model.car_follow_model={name}: SUMO has no such car-following"
-            f" model.{nearest(name, known)} Known: {', '.join(known)}."
+            f" model.{nearest(name, attributes_of)} Known: {', '.join(attributes_of)}."
         )
     for attribute in kind.attributes:
-        if attribute not in known[name]:
+        if attribute not in attributes_of[name]:
             raise ConfigError(
                 f"model: SUMO's {name} reads no attribute"
-                f" '{attribute}'.{nearest(attribute, known[name])} Known:"
-                f" {', '.join(sorted(known[name]))}."
+                f" '{attribute}'.{nearest(attribute, attributes_of[name])} Known:"
+                f" {', '.join(sorted(attributes_of[name]))}."
             )
 
 
@@ -69,8 +69,8 @@ def car_following() -> dict[str, frozenset[str]]:
     Raises:
         SumoError: the schema is not there.
     """
-    found = importlib.util.find_spec("sumo_data")
-    folders = found.submodule_search_locations if found is not None else None
+    package = importlib.util.find_spec("sumo_data")
+    folders = package.submodule_search_locations if package is not None else None
     for folder in folders or ():
         path = Path(folder, "data", "xsd", "types", "route.xsd")
         if path.is_file():
@@ -83,7 +83,7 @@ def car_following() -> dict[str, frozenset[str]]:
 
 def _read(path: Path) -> dict[str, frozenset[str]]:
     root = ElementTree.parse(path).getroot()  # noqa: S314 - SUMO's own file
-    types = {one.get("name", ""): one for one in root.iter(f"{_XS}complexType")}
+    types = {element.get("name", ""): element for element in root.iter(f"{_XS}complexType")}
     models = {}
     for element in types["vTypeBaseType"].iter(f"{_XS}element"):
         name, kind = element.get("name", ""), element.get("type", "")
@@ -95,9 +95,9 @@ def _read(path: Path) -> dict[str, frozenset[str]]:
 
 def _attributes(types: Mapping[str, ElementTree.Element], name: str) -> set[str]:
     """Returns the attributes of a type and of those that it extends."""
-    found = set()
-    for one in types[name].iter(f"{_XS}attribute"):
-        found.add(one.get("name", ""))
+    names = set()
+    for element in types[name].iter(f"{_XS}attribute"):
+        names.add(element.get("name", ""))
     for base in types[name].iter(f"{_XS}extension"):
-        found |= _attributes(types, base.get("base", ""))
-    return found
+        names |= _attributes(types, base.get("base", ""))
+    return names

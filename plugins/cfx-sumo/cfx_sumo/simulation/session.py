@@ -58,15 +58,15 @@ class Session:
             SumoError: SUMO refuses a request, a vehicle is lost, a process ended, or the session
                 was closed meanwhile.
         """
-        asked = list(zip(self._numbers, requests, strict=False))
-        if not asked:
+        numbered = list(zip(self._numbers, requests, strict=False))
+        if not numbered:
             return []
         with self._lock:
             if self._pool is None:
                 self._pool = _Pool(self._workers)
             pool = self._pool
         try:
-            return pool.answer(asked)
+            return pool.answer(numbered)
         except BrokenProcessPool as error:
             with self._lock:  # threads that wait for the same processes say the same
                 pool.end(error)
@@ -97,12 +97,12 @@ class _Pool:
         self._remove = weakref.finalize(self, shutil.rmtree, self._folder, ignore_errors=True)
         self._executor = worker_pool(workers, begin, self._folder, folder=self._folder)
 
-    def answer(self, asked: list[tuple[int, Request]]) -> list[Answer]:
+    def answer(self, numbered: list[tuple[int, Request]]) -> list[Answer]:
         # None is cancelled where one fails: an executor that is shut down meanwhile would trip over
         # it, and whoever fails shuts it down soon.
-        futures = [self._executor.submit(answer, number, request) for number, request in asked]
+        futures = [self._executor.submit(answer, number, request) for number, request in numbered]
         answers = [future.result() for future in futures]
-        for (number, _), given in zip(asked, answers, strict=True):
+        for (number, _), given in zip(numbered, answers, strict=True):
             if given.number != number:
                 raise RuntimeError(f"SUMO's answer {given.number} was given to request {number}")
         return answers

@@ -146,20 +146,20 @@ class SumoStepper(Stepper):
         rows = frames - scene.entry + torch.arange(-steps, 0)[:, None]
         positions, speeds = [], []
         for part, answer in zip(parts, answers, strict=True):
-            own = rows[:, part]
-            positions.append(torch.from_numpy(answer.position).gather(0, own))
-            speeds.append(torch.from_numpy(answer.speed).gather(0, own))
+            rows_of_part = rows[:, part]
+            positions.append(torch.from_numpy(answer.position).gather(0, rows_of_part))
+            speeds.append(torch.from_numpy(answer.speed).gather(0, rows_of_part))
         return torch.cat(positions, dim=1), torch.cat(speeds, dim=1)
 
-    def _request(self, scene: _Scene, kind: VType, own: slice) -> Request:
+    def _request(self, scene: _Scene, kind: VType, part: slice) -> Request:
         """Returns the request for some followers, each from its entry on.
 
         For those that enter late the last frame is repeated.
         """
-        frames, entry = len(scene.leader_position), scene.entry[own]
+        frames, entry = len(scene.leader_position), scene.entry[part]
         rows = (entry + torch.arange(frames - int(entry.min()))[:, None]).clamp(max=frames - 1)
-        constants, names, attributes = _columns(scene.attributes, own)
-        leader_constants, leader_names, leader_attributes = _columns(scene.leader_attributes, own)
+        constants, names, attributes = _columns(scene.attributes, part)
+        leader_constants, leader_names, leader_attributes = _columns(scene.leader_attributes, part)
         header = {
             "dt": round(self.dt * 1000) / 1000,
             "seed": self._seed,
@@ -172,10 +172,10 @@ class SumoStepper(Stepper):
         arrays = {
             "attributes": attributes,
             "leader_attributes": leader_attributes,
-            "start": scene.start[:, own].numpy(),
-            "leader_position": scene.leader_position[:, own].gather(0, rows).numpy(),
-            "leader_speed": scene.leader_speed[:, own].gather(0, rows).numpy(),
-            "leader_acceleration": scene.leader_acceleration[:, own].gather(0, rows).numpy(),
+            "start": scene.start[:, part].numpy(),
+            "leader_position": scene.leader_position[:, part].gather(0, rows).numpy(),
+            "leader_speed": scene.leader_speed[:, part].gather(0, rows).numpy(),
+            "leader_acceleration": scene.leader_acceleration[:, part].gather(0, rows).numpy(),
         }
         return Request(header, arrays)
 
@@ -275,7 +275,7 @@ def require_in_sumo(model: DrivingModel) -> InSumo:
 
 
 def _columns(
-    values: Mapping[str, Tensor | str], own: slice
+    values: Mapping[str, Tensor | str], part: slice
 ) -> tuple[dict[str, str], list[str], Array]:
     """Splits attributes into constants, and the names and columns `(n, names)` of the others."""
     constants: dict[str, str] = {}
@@ -284,9 +284,9 @@ def _columns(
         if isinstance(value, str):
             constants[name] = value
         else:
-            columns[name] = value[own]
+            columns[name] = value[part]
     if not columns:
-        return constants, [], np.empty((own.stop - own.start, 0))
+        return constants, [], np.empty((part.stop - part.start, 0))
     return constants, list(columns), torch.stack(list(columns.values()), dim=1).numpy()
 
 

@@ -109,19 +109,19 @@ class Roads:
     def _load(self, request: Request, origin: Array) -> None:
         """Puts all vehicles where they start."""
         header, arrays = request
-        own = _attributes(header["constants"], header["names"], arrays["attributes"])
+        attributes = _attributes(header["constants"], header["names"], arrays["attributes"])
         ahead = _attributes(
             header["leader_constants"], header["leader_names"], arrays["leader_attributes"]
         )
         position = (arrays["start"][0] - origin).tolist()
         leader_position = (arrays["leader_position"][0] - origin).tolist()
         speed, leader_speed = arrays["start"][1].tolist(), arrays["leader_speed"][0].tolist()
-        count = len(own)
+        count = len(attributes)
         leaders, followers = [], []
         for i in range(count):
-            own[i]["carFollowModel"] = header["car_follow_model"]
+            attributes[i]["carFollowModel"] = header["car_follow_model"]
             leaders.append(Placed(ahead[i], leader_position[i], leader_speed[i]))
-            followers.append(Placed(own[i], position[i], speed[i]))
+            followers.append(Placed(attributes[i], position[i], speed[i]))
         net = self._folder / f"{count}.net.xml"
         if not net.exists():
             net.write_text(network(count))
@@ -202,13 +202,13 @@ def _attributes(
 
 def begin(folder: Path) -> None:
     """Prepares this process, which has a folder of its own inside `folder`."""
-    own = folder / str(os.getpid())
-    own.mkdir()
+    place = folder / str(os.getpid())
+    place.mkdir()
     # What SUMO prints says why it refuses something.
-    log = os.open(own / LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+    log = os.open(place / LOG, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
     os.dup2(log, 1)
     os.dup2(log, 2)
-    _ROADS[:] = [Roads(own)]
+    _ROADS[:] = [Roads(place)]
 
 
 def answer(number: int, request: Request) -> Answer:
@@ -246,11 +246,11 @@ def _in_words(error: str, log: str) -> str:
 
 def printed_errors(log: str) -> list[str]:
     """Returns the errors among the lines that SUMO has printed, each once."""
-    found: dict[str, None] = {}
+    errors: dict[str, None] = {}
     for line in log.splitlines():
         if line.startswith("Error:"):
-            found[line.removeprefix("Error:").strip().rstrip(".")] = None
-    return list(found)
+            errors[line.removeprefix("Error:").strip().rstrip(".")] = None
+    return list(errors)
 
 
 def printed_here() -> str:
