@@ -24,6 +24,7 @@ from cfx.data.signals import RECORDED
 from cfx.data.tidy import write_tidy
 from cfx.errors import DataError
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers
+from cfx.evaluation.protocols.folds import Together, describe_folds
 from cfx.evaluation.result import Purpose
 from cfx.learners.base import TrainingData, TrainingResult
 from cfx.learners.rollout import RolloutLearner
@@ -122,6 +123,23 @@ def test_each_site_is_left_out_once() -> None:
     fold = AcrossDrivers(folds=None, together="site").folds(pairs, seed=0).tolist()
     assert fold[0] == fold[2]
     assert sorted({fold[0], fold[1], fold[3]}) == [0, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("sites", "together", "others"),
+    [
+        (("road", "track"), "site", "1 other site"),
+        (("road", "track", "city"), "site", "2 other sites"),
+        (("road", "track", "city"), "driver", "2 other folds"),
+    ],
+)
+def test_it_is_said_what_constants_are_pooled_over(
+    sites: tuple[str, ...], together: Together, others: str
+) -> None:
+    pairs = at_sites(*((site, "", "") for site in sites))
+    described = describe_folds(pairs, torch.arange(len(pairs)), together)
+    assert described["pooled_over"] == others
+    assert described["recordings_per_fold"] == [[pair.recording] for pair in pairs]
 
 
 def test_all_drives_of_a_car_stay_together_if_wanted() -> None:
