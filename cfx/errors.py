@@ -86,11 +86,15 @@ class SumoError(CfxError):
 
 
 def nearest(name: str, choices: Iterable[str]) -> str:
-    """Returns " Did you mean 'x'?" for the nearest of `choices`, or "" if none is near."""
-    close = difflib.get_close_matches(name, list(choices), n=1, cutoff=0.5)
+    """Returns " Did you mean 'x'?" for the nearest of `choices`, or "" if none is near.
+
+    Capital letters make no difference: `idm` is near IDM.
+    """
+    in_lower_case = {choice.lower(): choice for choice in choices}
+    close = difflib.get_close_matches(name.lower(), in_lower_case, n=1, cutoff=0.5)
     if not close:
         return ""
-    return f" Did you mean '{close[0]}'?"
+    return f" Did you mean '{in_lower_case[close[0]]}'?"
 
 
 def first_line(error: BaseException) -> str:

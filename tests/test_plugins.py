@@ -14,7 +14,8 @@ import pytest
 import cfx
 from cfx.app import application, cli
 from cfx.core import registry
-from cfx.errors import PluginError
+from cfx.errors import PluginError, TrackingError
+from cfx.results.tracker import folder_of
 from tests.broken_plugins import BROKEN, MODEL, QUICK, Broken, install_twins, put
 from tests.installer import Installer
 
@@ -158,6 +159,19 @@ def test_show_says_how_one_asks_for_what_has_no_settings(
     printed = capsys.readouterr().out
     assert use in printed
     assert "It has no settings." in printed
+
+
+def test_a_broken_tracker_keeps_nobody_from_a_run_of_another(
+    install: Installer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    install(
+        "no-list", {"cfx.trackers": {"a_list": "no_list:Runs"}}, {"no_list.py": "import nobody"}
+    )
+    with pytest.raises(TrackingError, match="'nowhere' is no folder"):
+        folder_of("nowhere")
+    assert "Runs of tracking.name=a_list are not found: tracker 'a_list'" in caplog.text
+    assert "no-list 1.0" in caplog.text
 
 
 def test_plugins_lists_metadata_and_loads_nothing(install: Installer, capsys) -> None:

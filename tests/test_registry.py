@@ -71,6 +71,8 @@ def test_a_third_partys_model_is_listed_without_running_its_code_and_then_create
 def test_unknown_names_are_answered_with_the_nearest() -> None:
     with pytest.raises(PluginError, match=r"model=kraus: .*Did you mean 'krauss'\? Known: .*w99"):
         registry.get("model", "kraus")
+    with pytest.raises(PluginError, match=r"model=IDM: .*Did you mean 'idm'\?"):
+        registry.get("model", "IDM")
     with pytest.raises(PluginError, match=r"'modle'.*Did you mean 'model'"):
         registry.names("modle")
 

@@ -186,10 +186,10 @@ def extract_pairs(tracks: Tracks, *, max_gap: float | None = None) -> PairSet:
 def vehicles_apart(tracks: _Tracks) -> _Tracks:
     """Returns tracks in which an id that stands for two vehicles is two, each of one length.
 
-    Two recordings in one file use the same ids. An id goes over to another vehicle where its length
-    or class is another from then on, or where it is, in the same lane, farther back than before or
-    farther ahead than any vehicle drives in that time. A few wrong rows make no vehicle. The second
-    vehicle of an id is called `ID-vehicle2`. Lengths become each vehicle's median.
+    Two recordings in one file use the same ids. An id stands for another vehicle from the row on in
+    which its length or class changes for good, or in which it is, in the same lane, behind its last
+    place or farther ahead than any vehicle drives in that time. A few wrong rows make no vehicle.
+    The second vehicle of an id is called `ID-vehicle2`. Lengths become each vehicle's median.
     """
     begins = changes(tracks.recording, tracks.vehicle)
     is_again = np.zeros(len(tracks), dtype=bool)

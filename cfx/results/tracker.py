@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 from cfx.core import registry
 from cfx.core.storage import is_url, local_folder
+from cfx.errors import PluginError
 from cfx.policies.ready import folder_of_ready_made, is_ready_made
 
 if TYPE_CHECKING:
@@ -148,8 +149,16 @@ def tracked(config: JobConfig, folder: Path) -> Iterator[Tracker]:
 
 
 def tracking_of_run(text: str) -> Tracking:
-    """Returns the first installed tracking whose ids of runs look like this; else MLflow."""
-    for tracking in map(tracking_named, registry.names("tracker")):
+    """Returns the first installed tracking whose ids of runs look like this; else MLflow.
+
+    One that cannot be imported is warned of, and keeps nobody from the others' runs.
+    """
+    for name in registry.names("tracker"):
+        try:
+            tracking = tracking_named(name)
+        except PluginError as error:
+            log.warning("Runs of tracking.name=%s are not found: %s", name, error)
+            continue
         if tracking.is_run_id(text):
             return tracking
     return tracking_named(MLFLOW)

@@ -13,10 +13,14 @@ import json
 from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from cfx.errors import TrackingError
-from cfx.plugin import JobConfig, Origin, Result, Tracker, Tracking
+from cfx.plugin import Origin, Tracker, Tracking
+
+if TYPE_CHECKING:
+    # `cfx drive` asks trackers for runs in SUMO's process, which has no pyarrow; results need it.
+    from cfx.plugin import JobConfig, Result
 
 FILE = "run_list.jsonl"
 PREFIX = "run_list-"

@@ -1,5 +1,7 @@
 """What is kept of runs, and what is said of those that are not there."""
 
+import subprocess
+import sys
 from types import SimpleNamespace
 
 import cfx
@@ -29,6 +31,11 @@ def track(folder, metrics, uri=None):
 def test_cfx_finds_it():
     found = cfx.get("tracker", "run_list")
     assert found is RunList, "install it first: pip install --editable ."
+
+
+def test_it_needs_no_pyarrow_which_does_not_get_on_with_sumo():
+    script = "import sys; sys.modules['pyarrow'] = None; import cfx_example.tracker"
+    subprocess.run([sys.executable, "-c", script], check=True)
 
 
 def test_a_run_leads_to_its_job(folder):
