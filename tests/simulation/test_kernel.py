@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -121,7 +122,7 @@ def terms_of(objective: Objective) -> Terms:
         speed, gap, measured_speed, measured_gap = signals
         return objective.terms(FrameValues(speed, gap, measured_speed, measured_gap, DT))
 
-    return Terms(of_frame, type(objective).__name__)
+    return Terms(of_frame, f"{type(objective).__name__} {objective.settings!r}")
 
 
 @pytest.mark.parametrize("name", with_equations())
@@ -141,8 +142,16 @@ def test_every_model_has_a_kernel_with_the_losses_of_its_trajectories(
 
 @pytest.mark.parametrize("name", registry.names("objective"))
 def test_every_objective_is_summed_up_as_it_is_computed(name: str) -> None:
+    check_sums_of({"name": name})
+
+
+def test_an_objectives_setting_is_in_its_sums() -> None:
+    check_sums_of({"name": "speed_huber", "delta": 0.1})
+
+
+def check_sums_of(node: Mapping[str, Any]) -> None:
     model = Krauss()
-    objective = registry.create("objective", {"name": name})
+    objective = registry.create("objective", node)
     assert isinstance(objective, Objective)
     segments, p = made_up_segments(), candidates_of(model)
     found = summed_up(MemoryStepper(model, DT, compile="always"), objective, segments, p)
