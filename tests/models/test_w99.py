@@ -59,3 +59,50 @@ def test_it_does_not_creep_into_a_standing_leader() -> None:
             *(torch.tensor(x, dtype=torch.float64) for x in (0.0, speed, 0.0)), torch.zeros(0)
         )
         assert W99().next_speed(follower, leader, p, 0.1).item() == pytest.approx(wanted)
+
+
+OF_ITS_REGIME = {
+    # Thresholds at 10 m/s: near 1.5 + 1.3 * 10 = 14.5 m, far 14.5 + 8 = 22.5 m.
+    "too close": ((10.0, 0.0), (6.0, 9.5, -0.4), -0.4 + 0.5**2 / (1.5 - 6.0)),
+    "approaching": ((10.0, 0.0), (40.0, 7.0, 0.0), 0.5 * 3.0**2 / (14.5 - 40.0 - 0.1)),
+    "following, slower": ((10.0, -0.4), (20.0, 9.9, 0.0), -0.4),
+    "following, faster": ((10.0, 0.1), (20.0, 9.9, 0.0), 0.25),
+    "closing the gap": ((10.0, 0.0), (20.0, 11.0, 0.0), 1.0**2 / (22.5 - 20.0)),
+}
+"""Speed and last acceleration; gap, the leader's speed and acceleration; what follows by hand."""
+
+
+def acceleration_of(
+    model: W99, follower: tuple[float, float], leader: tuple[float, float, float]
+) -> float:
+    """Returns the acceleration over a step of 0.1 s, m/s2, with SUMO's defaults."""
+
+    def number(value: float) -> torch.Tensor:
+        return torch.tensor(value, dtype=torch.float64)
+
+    defaults = {"cc0": 1.5, "cc1": 1.3, "cc2": 8.0, "cc3": -12.0, "cc4": -0.25, "cc5": 0.35}
+    defaults |= {"cc6": 6.0, "cc7": 0.25}
+    p = dict(model.space.unpack(model.space.defaults()))
+    p |= {name: number(value) for name, value in defaults.items()}
+    (speed, acceleration), (gap, leader_speed, leader_acceleration) = follower, leader
+    next_speed = model.next_speed(
+        Follower(number(0.0), number(speed), number(acceleration), torch.zeros(0)),
+        Leader(number(gap + 5.0), number(leader_speed), number(leader_acceleration), number(5.0)),
+        p,
+        0.1,
+    )
+    return (next_speed.item() - speed) / 0.1
+
+
+@pytest.mark.parametrize("regime", OF_ITS_REGIME)
+def test_each_regime_accelerates_by_its_equation(regime: str) -> None:
+    follower, leader, wanted = OF_ITS_REGIME[regime]
+    assert acceleration_of(W99(), follower, leader) == pytest.approx(wanted)
+
+
+def test_mixed_regimes_are_each_what_a_vehicle_can_do() -> None:
+    # 0.09 m before the threshold of the gap the approach asks for -1,250 m/s2, which counts half.
+    leader = (14.5 - 0.09, 5.0, 0.0)
+    exact = acceleration_of(W99(), (10.0, 0.0), leader)
+    mixed = acceleration_of(W99().at_temperature(1.0), (10.0, 0.0), leader)
+    assert -9.0 < mixed < exact

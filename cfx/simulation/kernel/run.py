@@ -313,8 +313,6 @@ def _signal(value: Tensor) -> _TensorView:
 
 
 def _parameter(value: Tensor, problems: int, candidates: int) -> _TensorView:
-    if value.dim() == 0:
-        return _TensorView(value.data_ptr(), 0, 0)
     # An expanded view: where problems or candidates share a value, its stride is 0.
     of_all = value.expand(problems, candidates)
     return _TensorView(of_all.data_ptr(), of_all.stride(0), of_all.stride(1))
