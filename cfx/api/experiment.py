@@ -12,8 +12,9 @@ from typing import Any, Protocol, TypeVar
 
 from cfx.api.pairs import Pairs, PairsLike, pairs_from, without_data
 from cfx.app.job.run import compute
-from cfx.app.overrides import IN_MEMORY, command_of, config_of
+from cfx.app.overrides import command_of, config_of
 from cfx.core import registry
+from cfx.core.files import IN_MEMORY
 from cfx.core.guest import visit
 from cfx.errors import ConfigError
 from cfx.models.base import DrivingModel

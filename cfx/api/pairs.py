@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 import pandas as pd
 
-from cfx.app.overrides import IN_MEMORY, config_of
+from cfx.app.overrides import config_of
 from cfx.core import registry
 from cfx.core.component import validate
-from cfx.core.files import absolute
+from cfx.core.files import IN_MEMORY, absolute
 from cfx.core.storage import is_url
 from cfx.data.base import Dataset
 from cfx.data.describe import dataset_of

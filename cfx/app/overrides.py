@@ -11,7 +11,7 @@ from typing import Any
 from cfx.app import hydra_source
 from cfx.app.user_errors import explained
 from cfx.core import registry
-from cfx.core.files import quoted
+from cfx.core.files import IN_MEMORY, quoted
 from cfx.errors import DataError
 from cfx.results.config import JobConfig
 
@@ -34,10 +34,6 @@ def config_of(settings: Mapping[str, Any]) -> JobConfig:
     with explained(overrides):
         values = hydra_source.plain(hydra_source.composed(overrides))
     return JobConfig.of(values)
-
-
-IN_MEMORY = "<in memory>"
-"""What a configuration calls a data frame, or a policy that was not saved, in place of its path."""
 
 
 def command_of(config: JobConfig) -> str:

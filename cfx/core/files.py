@@ -55,6 +55,9 @@ def absolute(value: Any) -> Path:
 FilePath = Annotated[Path, BeforeValidator(absolute)]
 """A path that a user writes."""
 
+IN_MEMORY = "<in memory>"
+"""What a configuration calls a data frame, or a policy that was not saved, in place of its path."""
+
 
 @contextmanager
 def atomic_write(path: Path) -> Iterator[Path]:

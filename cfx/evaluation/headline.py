@@ -9,6 +9,7 @@ from typing import NamedTuple
 from cfx.evaluation.metrics.base import RMSE_SPEED, MetricInfo, key_of
 
 __all__ = [
+    "interval_in_words",
     "summaries_disagree",
 ]
 """What plugins may use, as `cfx.plugin.headline`."""
@@ -107,6 +108,9 @@ def summaries_disagree(geometric: float, ratio_of_means: float) -> str:
         return ""
     return f"of the mean errors {100 * ratio_of_means:+.1f} %"
 
+
+_FARTHEST_END = -10.0
+"""Improvement below which an interval's end is told as no more than that."""
 
 FEW_DRIVERS = 10
 """Of fewer drivers than these an improvement says little about others."""
@@ -229,19 +233,35 @@ def fitted_errors(errors: Mapping[str, float]) -> dict[str, float]:
     return fitted
 
 
+def interval_in_words(low: float, high: float, unit: str = "") -> str:
+    """Returns an improvement's interval in percent: "-1.2 to +3.4"; "one driver" if there is none.
+
+    That of two or three drivers may begin anywhere: "below -1000" is all that is said of it.
+    """
+    if not math.isfinite(low):
+        return "one driver"
+    ends = []
+    for end in (low, high):
+        percent = f"{100 * end:+.1f}"
+        if end < _FARTHEST_END:
+            percent = f"below {100 * _FARTHEST_END:.0f}"
+        ends.append(percent + unit)
+    return " to ".join(ends)
+
+
 def _improvement(
     metrics: Mapping[str, float], compared: Comparison, values: dict[str, float]
 ) -> str:
     """Returns the improvement in words, and adds its numbers to `values`."""
     geometric = 100 * metrics[f"{compared.key}/geometric"]
-    low = 100 * metrics.get(f"{compared.key}/ci95_low", math.nan)
-    high = 100 * metrics.get(f"{compared.key}/ci95_high", math.nan)
+    low = metrics.get(f"{compared.key}/ci95_low", math.nan)
+    high = metrics.get(f"{compared.key}/ci95_high", math.nan)
     values[PERCENT] = round(geometric, 1)
     text = f"{geometric:+.1f} %"
     if math.isfinite(low) and math.isfinite(high):
-        values["improvement_low_percent"] = round(low, 1)
-        values["improvement_high_percent"] = round(high, 1)
-        text += f" ({low:+.1f} to {high:+.1f})"
+        values["improvement_low_percent"] = round(100 * low, 1)
+        values["improvement_high_percent"] = round(100 * high, 1)
+        text += f" ({interval_in_words(low, high)})"
     text += f" over {_CONSTANT[compared.baseline]}"
     if compared.scope != "test":
         text += " on full trajectories"

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.evaluation.headline import lower_by, summaries_disagree
+from cfx.evaluation.headline import interval_in_words, lower_by, summaries_disagree
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -412,9 +412,7 @@ def verdict(ranking: Ranking) -> str:
         text += ", significantly"
     else:
         text += f", but significantly closer than only {ahead} of {others} others"
-    interval = "one driver"
-    if math.isfinite(improvement.ci95_low):
-        interval = f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"
+    interval = interval_in_words(improvement.ci95_low, improvement.ci95_high)
     note = summaries_disagree(improvement.geometric, improvement.ratio_of_means)
     if note:
         interval += f"; {note}"

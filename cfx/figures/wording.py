@@ -7,7 +7,7 @@ import os
 import re
 from typing import NamedTuple
 
-from cfx.evaluation.headline import FEW_DRIVERS
+from cfx.evaluation.headline import FEW_DRIVERS, interval_in_words
 from cfx.evaluation.metrics.base import SCOPES
 
 __all__ = [
@@ -22,6 +22,7 @@ __all__ = [
     "method_label",
     "number_text",
     "percent",
+    "percent_interval",
     "percent_or_undefined",
     "plural",
     "pretty_unit",
@@ -140,6 +141,11 @@ def explained(method: str) -> str:
 def percent(fraction: float, digits: int = 0) -> str:
     """Returns a signed percentage with a real minus sign: 0.1234 -> "+12 %"."""
     return f"{100 * fraction:+.{digits}f} %".replace("-", MINUS)
+
+
+def percent_interval(low: float, high: float) -> str:
+    """Returns an interval of signed percentages with real minus signs: "+1.2 % to +3.4 %"."""
+    return interval_in_words(low, high, " %").replace("-", MINUS)
 
 
 def percent_or_undefined(fraction: float, digits: int = 0) -> str:

@@ -109,7 +109,7 @@ def test_a_result_is_saved_loaded_tested_and_drawn(
 def test_pairs_that_were_learned_from_are_refused(
     trained: cfx.plugin.Result, pairs: cfx.Pairs
 ) -> None:
-    with pytest.raises(DataError, match="has learned from 4 of the 4 pairs"):
+    with pytest.raises(DataError, match=r"run=<in memory>: .* has learned from 4 of the 4 pairs"):
         cfx.evaluate(trained, pairs)
     with pytest.raises(DataError, match="has learned from 4 of the 4 pairs"):
         cfx.forecast(trained, pairs, at=10.0)

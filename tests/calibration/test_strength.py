@@ -12,7 +12,7 @@ from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
-from cfx.calibration.strength import FITTED, WEIGHTS, PriorStrength
+from cfx.calibration.strength import FITTED, MOST, WEIGHTS, PriorStrength
 from cfx.data.pairs import PairBatch
 from cfx.models.krauss import Krauss
 from cfx.simulation.rollout import MemoryStepper
@@ -46,6 +46,12 @@ def test_what_is_chosen_is_what_is_calibrated_with(calibrator: Calibrator) -> No
     given = replace(calibrator.solver, prior=strength.weight, chooses_prior=False)
     same = Calibrator(given, cache=Cache(None)).driver_specific(pairs, batch, last)
     assert torch.equal(found, same)
+
+
+def test_of_many_pairs_some_from_first_to_last_are_tried(calibrator: Calibrator) -> None:
+    pairs = SyntheticDataset(pairs=MOST + 8, frames=60).load()
+    last = torch.full((len(pairs),), 50)
+    assert calibrator.prior_strength(pairs, PairBatch.of(pairs), last).pairs == (MOST + 8) // 2
 
 
 def test_nothing_after_what_may_be_used_is_read(calibrator: Calibrator) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 
-from cfx.evaluation.headline import fitted_errors, headline, main_error
+from cfx.evaluation.headline import fitted_errors, headline, interval_in_words, main_error
 from cfx.evaluation.metrics.base import RMSE_SPEED
 
 METRICS = {
@@ -33,6 +33,12 @@ def test_an_improvement_is_in_percent_with_its_interval_and_names_a_better_basel
         "rmse_speed_driver_specific_mps": 0.735,
         "rmse_speed_pooled_mps": 0.686,
     }
+
+
+def test_an_interval_that_may_begin_anywhere_says_no_more() -> None:
+    assert interval_in_words(-0.012, 0.034) == "-1.2 to +3.4"
+    assert interval_in_words(-8.6e14, 1.0, " %") == "below -1000 % to +100.0 %"
+    assert interval_in_words(math.nan, math.nan) == "one driver"
 
 
 def test_mean_errors_that_contradict_are_told() -> None:

@@ -20,6 +20,7 @@ from cfx.policies.driver_step import DriverStep, Motion
 from cfx.policies.history import History, history_of, measured_history
 from cfx.policies.inputs import policy_inputs, require_no_further_signals
 from cfx.policies.inputs.base import PolicyInput
+from cfx.policies.inputs.motion import InverseTimeToCollision, TimeHeadway
 from cfx.simulation.rollout import MemoryStepper
 from tests.agents import adaptive
 from tests.drives import wavy_pairs
@@ -45,6 +46,18 @@ def test_measured_frames_have_the_further_signals_as_recorded() -> None:
     recent = measured_history(BATCH, rows, frame, 5)
     for name, values in recent.items():
         torch.testing.assert_close(values[1], everything[name][1, 46:51])
+    at_first = measured_history(BATCH, rows, torch.tensor([2, 0]), 5)
+    for name, values in at_first.items():
+        # The first frame stands for those before.
+        torch.testing.assert_close(values[0], everything[name][0, [0, 0, 0, 1, 2]])
+        torch.testing.assert_close(values[1], everything[name][1, [0, 0, 0, 0, 0]])
+
+
+def test_what_has_a_pole_is_bounded_there() -> None:
+    one = torch.ones(1, dtype=torch.float64)
+    standing = {"follower_speed": 0.0 * one, "leader_speed": 2.0 * one, "gap": 0.1 * one}
+    assert TimeHeadway().values(standing).item() == pytest.approx(0.1)
+    assert InverseTimeToCollision().values(standing).item() == pytest.approx(-2.0)
 
 
 def test_a_driver_elsewhere_is_given_further_signals_and_drives_as_in_evaluation() -> None:

@@ -18,7 +18,7 @@ from cfx.calibration.identifiability import NEARLY_BEST, flat_for
 from cfx.core.registry import Installed
 from cfx.errors import without_passwords
 from cfx.evaluation.demo import DEMO_PAGE
-from cfx.evaluation.headline import headline
+from cfx.evaluation.headline import headline, interval_in_words
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement
@@ -177,14 +177,8 @@ def _improvement_cell(improvement: Improvement) -> str:
     """Returns an improvement with its interval, in percent."""
     if not improvement.pairs:
         return "not defined"
-    return f"{100 * improvement.geometric:+.1f} ({_interval(improvement)})"
-
-
-def _interval(improvement: Improvement) -> str:
-    """Returns the interval of an improvement, in percent."""
-    if not math.isfinite(improvement.ci95_low):
-        return "one driver"
-    return f"{100 * improvement.ci95_low:+.1f} to {100 * improvement.ci95_high:+.1f}"
+    interval = interval_in_words(improvement.ci95_low, improvement.ci95_high)
+    return f"{100 * improvement.geometric:+.1f} ({interval})"
 
 
 def _fitted(evaluation: Evaluation) -> pd.DataFrame:
@@ -261,7 +255,7 @@ def _improvements_table(error: str, compared: Mapping[str, Improvement]) -> Tabl
         table.add_row(
             over,
             f"{100 * improvement.geometric:+.1f}",
-            _interval(improvement),
+            interval_in_words(improvement.ci95_low, improvement.ci95_high),
             f"{100 * improvement.ratio_of_means:+.1f}",
             f"{improvement.win_rate * improvement.pairs:.0f} of {improvement.pairs}",
             p_value,

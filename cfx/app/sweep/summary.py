@@ -14,7 +14,12 @@ from typing import TYPE_CHECKING, Any
 from cfx.app.sweep.folder import JobStatus, data_of, metrics_of
 from cfx.core.console import blank_table
 from cfx.core.files import atomic_write
-from cfx.evaluation.headline import doubts, judged_method, main_comparison
+from cfx.evaluation.headline import (
+    doubts,
+    interval_in_words,
+    judged_method,
+    main_comparison,
+)
 from cfx.evaluation.metrics.base import MetricInfo, key_of
 from cfx.evaluation.statistics import Ranking, ranking_of
 from cfx.figures.wording import short_label
@@ -248,7 +253,7 @@ class SweepSummary:
         cell = f"{100 * geometric:+.1f} %"
         low, high = row.get("improvement_ci95_low"), row.get("improvement_ci95_high")
         if low is not None and high is not None:
-            cell += f" ({100 * low:+.1f} to {100 * high:+.1f})"
+            cell += f" ({interval_in_words(low, high)})"
         baseline, comma, part = row["improvement_over"].partition(",")
         cell += f"\nover {short_label(baseline)}{comma}{part}"
         estimates = {"geometric": geometric}

@@ -14,7 +14,7 @@ import torch
 from pydantic import Field
 
 from cfx.core.component import Settings
-from cfx.core.files import FilePath
+from cfx.core.files import IN_MEMORY, FilePath
 from cfx.data.pairs import LearnedFrom, PairSet
 from cfx.errors import DataError
 from cfx.evaluation.protocols.across_drivers import AcrossDrivers, AcrossDriversSettings, Trained
@@ -125,6 +125,8 @@ class FinishedPolicy:
             DataError: it cannot, or it has.
         """
         policy, where = self.agent, f"protocol.run={self.run}"
+        if self.run.name == IN_MEMORY:
+            where = f"protocol.run={IN_MEMORY}"
         if abs(pairs.dt - policy.dt) > 1e-6:
             raise DataError(
                 f"{where}: this policy drives in steps of {policy.dt:g} s, {pairs.source} has"

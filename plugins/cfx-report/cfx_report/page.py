@@ -261,7 +261,7 @@ def _gain(job: Result, baseline: str) -> str:
         return "not defined"
     certainty = "no interval for a single driver"
     if np.isfinite(low):
-        certainty = f"95 % interval {wording.percent(low, 1)} to {wording.percent(high, 1)}"
+        certainty = f"95 % interval {wording.percent_interval(low, high)}"
     gain = f"{wording.percent(improvement.geometric, 1)} ({certainty})"
     note = headline.summaries_disagree(improvement.geometric, improvement.ratio_of_means)
     return f"{gain}, {note}" if note else gain

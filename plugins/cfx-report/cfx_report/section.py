@@ -210,7 +210,7 @@ def interval(low: float, high: float) -> Cell:
     """Returns a cell with an interval of signed percentages, sorted by its lower end."""
     if not (math.isfinite(low) and math.isfinite(high)):
         return Cell(wording.NOTHING, number=True)
-    return Cell(f"{wording.percent(low, 1)} to {wording.percent(high, 1)}", repr(low), number=True)
+    return Cell(wording.percent_interval(low, high), repr(low), number=True)
 
 
 def method_cell(method: str) -> Cell:

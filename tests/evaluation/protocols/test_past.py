@@ -17,12 +17,16 @@ import cfx
 from cfx.data.pairs import PairBatch
 from cfx.data.tidy import TidyDataset
 from cfx.errors import ConfigError, DataError
-from cfx.evaluation.protocols.past import PastErrors, with_bounds_of_other_folds
+from cfx.evaluation.closed_loop import Followers
+from cfx.evaluation.protocols.base import ProtocolContext
+from cfx.evaluation.protocols.past import PastErrors, past_errors, with_bounds_of_other_folds
 from cfx.evaluation.result import Array, Evaluation
+from cfx.policies.agent import Agent
 from cfx.policies.checkpoint import load_agent
 from cfx.policies.known_drivers import driver_features_of, unlikeness
 from cfx.policies.ready import folder_of_ready_made
 from cfx.results.tables import Past
+from tests.drives import straight_pairs
 
 QUICK = [
     "debug=quick",
@@ -63,6 +67,20 @@ def test_a_past_without_errors_or_too_short_says_what_it_can() -> None:
     past = PastErrors(own, policy, own, own)
     np.testing.assert_allclose(past.weight, [0.5, 1.0, 0.5])
     assert np.isnan(past.both[1])
+
+
+@pytest.mark.parametrize(("frames", "stride"), [(69, 5), (90, 60)])
+def test_a_past_whose_parts_are_shorter_than_three_seconds_says_nothing(
+    frames: int, stride: int
+) -> None:
+    # 6.9 s are divided into 4 and 2.9 s; of 9 s no window of 6 s lies within the first 5.4 s.
+    pairs = straight_pairs([100])
+    batch = PairBatch.of(pairs)
+    context = cast(ProtocolContext, SimpleNamespace(windows=SimpleNamespace(stride=stride)))
+    followers = Followers(batch, torch.zeros(1, dtype=torch.int64))
+    policy = cast(Agent, None)
+    past = past_errors(context, policy, pairs, followers, torch.tensor([frames]))
+    assert np.isnan(past.both).all()
 
 
 def test_bounds_know_nothing_of_the_driver_that_they_are_for() -> None:

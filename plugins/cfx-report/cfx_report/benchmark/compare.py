@@ -7,7 +7,7 @@ from pathlib import Path
 import pandas as pd
 
 from cfx.errors import DataError
-from cfx.plugin import Improvement, names, statistics
+from cfx.plugin import Improvement, headline, names, statistics
 from cfx_report.benchmark.row import COUNTS
 
 _NEEDED = ("row", "pair_id", "driver")
@@ -101,7 +101,9 @@ def lines_of(improvements: dict[tuple[str, str], Improvement]) -> list[str]:
     ]
     for (row, metric), improvement in improvements.items():
         # 0.0 is added so that no difference is +0.0 %, not -0.0 %.
-        interval = f"{improvement.ci95_low + 0.0:+.1%} to {improvement.ci95_high + 0.0:+.1%}"
+        interval = headline.interval_in_words(
+            improvement.ci95_low + 0.0, improvement.ci95_high + 0.0, "%"
+        )
         lines.append(
             f"| {row} | {metric} | {improvement.geometric + 0.0:+.1%} | {interval} |"
             f" {improvement.win_rate:.0%} of {improvement.pairs} | {improvement.p_value:.2g} |"

@@ -235,30 +235,30 @@ def _p_value(row: Any) -> Cell:
 STATISTICS: tuple[Column[Any], ...] = (
     Column(
         "Improvement",
-        lambda row: number(row.found.geometric, "+.1%"),
+        lambda row: number(row.improvement.geometric, "+.1%"),
         f"1 {wording.MINUS} the geometric mean over drivers of RMSE of the policy / RMSE of the"
         " baseline, RMSE of the speed over these frames. Above 0 the policy is closer to the real"
         " driver.",
     ),
     Column(
         "95 % interval",
-        lambda row: interval(row.found.ci95_low, row.found.ci95_high),
+        lambda row: interval(row.improvement.ci95_low, row.found.ci95_high),
         "Student's t interval of the drivers' logarithms of that ratio.",
     ),
     Column(
         "Of the mean errors",
-        lambda row: number(row.found.ratio_of_means, "+.1%"),
+        lambda row: number(row.improvement.ratio_of_means, "+.1%"),
         f"1 {wording.MINUS} mean RMSE of the policy / mean RMSE of the baseline: pairs with large"
         " errors weigh most.",
     ),
     Column(
         "Median",
-        lambda row: number(row.found.median, "+.1%"),
+        lambda row: number(row.improvement.median, "+.1%"),
         "Half of the drivers improve more.",
     ),
     Column(
         "Better for",
-        lambda row: number(row.found.win_rate, ".0%"),
+        lambda row: number(row.improvement.win_rate, ".0%"),
         "Share of the pairs with an improvement above 0.",
     ),
     Column(
@@ -269,12 +269,12 @@ STATISTICS: tuple[Column[Any], ...] = (
     ),
     Column(
         "Pairs",
-        lambda row: number(row.found.pairs, "d"),
+        lambda row: number(row.improvement.pairs, "d"),
         "Pairs that count. One does not if a method has no error or a simulation diverges.",
     ),
     Column(
         "Drivers",
-        lambda row: number(row.found.drivers, "d"),
+        lambda row: number(row.improvement.drivers, "d"),
         "Drivers of these pairs.",
     ),
 )
