@@ -242,7 +242,7 @@ STATISTICS: tuple[Column[Any], ...] = (
     ),
     Column(
         "95 % interval",
-        lambda row: interval(row.improvement.ci95_low, row.found.ci95_high),
+        lambda row: interval(row.improvement.ci95_low, row.improvement.ci95_high),
         "Student's t interval of the drivers' logarithms of that ratio.",
     ),
     Column(
@@ -278,7 +278,7 @@ STATISTICS: tuple[Column[Any], ...] = (
         "Drivers of these pairs.",
     ),
 )
-"""Of rows with an `Improvement`, `found`."""
+"""Of rows with an `Improvement`, `improvement`."""
 
 
 class SafetySection(Section):
