@@ -131,6 +131,12 @@ class Unnamed(PolicyInput):
         return history["gap"]
 
 
+class Meaningless(Unnamed):
+    """Says what it reads alone."""
+
+    signals = (SIGNALS["gap"],)
+
+
 class OtherRain(PolicyInput):
     """Means something else by the same name."""
 
@@ -142,8 +148,9 @@ class OtherRain(PolicyInput):
 
 
 def test_inputs_say_what_they_read() -> None:
-    with pytest.raises(PluginError, match="does not say which signals it reads"):
-        registry.add("input", "unnamed", Unnamed)
+    for says_too_little in (Unnamed, Meaningless):
+        with pytest.raises(PluginError, match="does not say which signals it reads"):
+            registry.add("input", "unnamed", says_too_little)
     registry.add("input", "other_rain", OtherRain)
     try:
         with pytest.raises(PluginError, match=r"the signal 'rain' .* is declared in two ways"):
