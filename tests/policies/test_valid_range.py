@@ -7,11 +7,20 @@ from dataclasses import replace
 import pytest
 import torch
 
+from cfx.data.pairs import PairBatch
 from cfx.policies import valid_range
 from cfx.policies.context import DriverContext
 from cfx.policies.history import History
-from cfx.policies.valid_range import FADED, ValidRange, share_in_words, situations, weight_of_answer
+from cfx.policies.valid_range import (
+    FADED,
+    ValidRange,
+    recorded_quantiles,
+    share_in_words,
+    situations,
+    weight_of_answer,
+)
 from tests.agents import adaptive
+from tests.drives import straight_pairs
 from tests.histories import observed
 
 
@@ -109,3 +118,14 @@ def test_words_say_how_much_and_why() -> None:
     assert words == "37 % of steps outside what the policy has learned (speed above 15 m/s)"
     assert share_in_words(RANGE, 0, 100, beyond) == ""
     assert valid_range.in_words(RANGE, torch.zeros(10)) == ""
+
+
+def test_recordings_are_kept_as_quantiles_of_what_moves() -> None:
+    # Gaps of 20 m: 2 s at 10 m/s; standing has no time gap.
+    moving, standing = PairBatch.of(straight_pairs([101])), PairBatch.of(straight_pairs([50], 0.0))
+    kept = recorded_quantiles(moving)
+    assert kept["speed"] == pytest.approx((10.0,) * 3)
+    assert kept["time_gap"] == pytest.approx((2.0,) * 3)
+    ramp = replace(moving, follower_acceleration=torch.arange(101.0)[None])
+    assert recorded_quantiles(ramp)["acceleration"] == (5.0, 50.0, 95.0)
+    assert recorded_quantiles(standing)["time_gap"] == ()
