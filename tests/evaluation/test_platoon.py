@@ -53,6 +53,16 @@ class Linear(DrivingModel):
         return (follower.speed + answer * dt).clamp(min=0.0)
 
 
+class Anticipating(Linear):
+    """As `Linear`, and with half of the leader's acceleration."""
+
+    def next_speed(
+        self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
+    ) -> Tensor:
+        speed = super().next_speed(follower, leader, p, dt)
+        return (speed + 0.5 * leader.acceleration * dt).clamp(min=0.0)
+
+
 STABLE, UNSTABLE = (2.0, 0.5, 0.8), (1.0, 0.4, 0.5)  # 5.2 and 1.4
 
 
@@ -112,8 +122,9 @@ def test_who_does_not_follow_amplifies_nothing() -> None:
     assert np.isnan(row["amplification"])
 
 
-def test_each_vehicle_drives_as_it_would_alone_behind_the_one_before() -> None:
-    model, short = Krauss(), Manoeuvre(settle=5, after=5, hold=2)
+@pytest.mark.parametrize("model", [Krauss(), Anticipating()])
+def test_each_vehicle_drives_as_it_would_alone_behind_the_one_before(model: DrivingModel) -> None:
+    short = Manoeuvre(settle=5, after=5, hold=2)
     policy = adaptive(
         model, GruPolicy(start="middle", inputs=("leader_speed", "follower_speed", "gap")), 2, 15
     )
