@@ -7,7 +7,7 @@
 #   make settings [EVERY=20]                  each setting of each option changes what a job writes, or is refused (every 20th alone)
 #   make fuzz [EXAMPLES=5000]                 bad configurations, recordings, policies and caches; each file of a job fails once
 #   make hostile [FILES=1000]                 hostile but plausible recordings: read as they are meant, or refused with the reason
-#   make mutants [MUTANTS=300 SEED=0 ROOMS="calibration simulation"]   change the code at random; what no test of its room notices
+#   make mutants [MUTANTS=300 SEED=0 ROOMS="calibration simulation" SECONDS=60]   change the code at random; what no test of its room notices
 #   make kills [KILLS=100]                    kill a sweep at random moments, with each launcher
 #   make policies                             train the ready-made policies anew from ../shared/data (two hours)
 #   make dist                                 build cfx and the plugins into dist/, install cfx alone into a clean environment, then all, try both
@@ -58,10 +58,10 @@ fuzz: $(VENV)/.ready-test
 hostile: $(VENV)/.ready-test
 	$(BIN)/python -m tests.benchmarks.hostile_files --files $(or $(FILES),1000) --data $(DATA)
 
-# Goes on where it was interrupted; a mutant takes as long as its room's tests at most, three times as long where it hangs.
+# Goes on where it was interrupted; a mutant meets tests of SECONDS at most, and takes three times as long where it hangs.
 mutants: $(VENV)/.ready-test
 	$(PIP) install --quiet --constraint constraints.txt --editable '.[mutants]'
-	$(BIN)/python -m tests.mutants --count $(or $(MUTANTS),300) --seed $(or $(SEED),0) $(if $(ROOMS),--rooms $(ROOMS))
+	$(BIN)/python -m tests.mutants --count $(or $(MUTANTS),300) --seed $(or $(SEED),0) --seconds $(or $(SECONDS),60) $(if $(ROOMS),--rooms $(ROOMS))
 
 kills: $(VENV)/.ready-test
 	CFX_KILLS=$(or $(KILLS),100) $(BIN)/python -m pytest -m slow tests/fuzz/test_kills.py -s

@@ -7,8 +7,8 @@ out. They are drawn by a seed, the place first and then the change, so that plac
 changes do not outweigh others. What changes annotations alone, or `strict` of a `zip`, is left out.
 Each mutant is a change of a copy of the checkout in `.mutants`, and meets those tests of its room
 that run its lines (coverage.py), files with the quickest first; where no test does by itself, as
-with what is run on import, the whole room. The first failure kills it, as does a run of more than
-three times as long as without a change.
+with what is run on import, those of the whole room. They are as many as take `--seconds` without a
+change. The first failure kills it, as does a run of more than three times as long.
 
 Verdicts are kept in `.mutants/verdicts.jsonl`, by the content of what was changed and, of
 survivors, of their room's tests: a run that was interrupted goes on, a mutant of a file that has
@@ -23,8 +23,8 @@ import argparse
 import ast
 import hashlib
 import importlib
+import itertools
 import json
-import math
 import os
 import random
 import shutil
@@ -219,17 +219,23 @@ class Covered(NamedTuple):
                 lines[line] = sorted(named & seconds.keys())
         return cls(by_line, seconds)
 
-    def of(self, mutant: Mutant) -> list[str]:
-        """Returns the tests that run the statement of a mutant, files with the quickest first."""
+    def of(self, mutant: Mutant, most_s: float) -> list[str]:
+        """Returns the quickest tests that run the statement of a mutant, the quickest file first.
+
+        Args:
+            mutant: where no test runs it, all tests of the room count.
+            most_s: how long they take at most without a change; the quickest is kept in any case.
+        """
         lines = self.tests.get(mutant.module, {})
         tests: set[str] = set()
         for line in _statement(TREE / mutant.module, mutant.line):
             tests.update(lines.get(line, ()))
-        files: dict[str, float] = {}
-        for test in tests:
-            file = test.partition("::")[0]
-            files[file] = min(files.get(file, math.inf), self.seconds[test])
-        return sorted(tests, key=lambda test: (files[test.partition("::")[0]], test))
+        quickest = sorted(tests or self.seconds, key=lambda test: (self.seconds[test], test))
+        ends = itertools.accumulate(self.seconds[test] for test in quickest)
+        kept = [test for test, end in zip(quickest, ends, strict=True) if end <= most_s]
+        kept = kept or quickest[:1]
+        files = list(dict.fromkeys(test.partition("::")[0] for test in kept))
+        return sorted(kept, key=lambda test: (files.index(test.partition("::")[0]), test))
 
 
 def _statement(path: Path, line: int) -> range:
@@ -277,19 +283,22 @@ def fails(tests: Sequence[str], timeout_s: float | None, **variables: str) -> bo
     return done.returncode != 0
 
 
-def judged(mutant: Mutant, covered: Covered) -> Verdict:
-    """Runs tests of a mutant's room against it."""
-    tests = covered.of(mutant)
-    names = tests or covered.seconds
-    usual = sum(covered.seconds[name] for name in names)
-    timeout_s = max(LEAST_TIMEOUT_S, SLOWER * usual)
+def judged(mutant: Mutant, tests: Sequence[str], usual_s: float) -> Verdict:
+    """Runs tests against a mutant.
+
+    Args:
+        mutant: what is changed.
+        tests: of its room.
+        usual_s: how long they take without a change.
+    """
+    timeout_s = max(LEAST_TIMEOUT_S, SLOWER * usual_s)
     path = TREE / mutant.module
     source, changed = path.read_text(encoding="utf-8"), mutated(mutant)
     assert changed is not None
     path.write_text(changed, encoding="utf-8")
     try:
         outcome = {True: "killed", False: "survived", None: "timeout"}
-        verdict = outcome[fails(tests or [f"tests/{mutant.room}"], timeout_s)]
+        verdict = outcome[fails(tests, timeout_s)]
     finally:
         path.write_text(source, encoding="utf-8")
     before, after = _first_difference(source.splitlines(), changed.splitlines())
@@ -372,6 +381,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=300)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rooms", nargs="*", choices=ROOMS, default=list(ROOMS))
+    parser.add_argument("--seconds", type=float, default=60.0, help="of tests for each mutant")
     options = parser.parse_args()
     os.nice(10)
     FOLDER.mkdir(parents=True, exist_ok=True)
@@ -384,7 +394,9 @@ def main() -> None:
         if verdict is None:
             if mutant.room not in covered:
                 covered[mutant.room] = Covered.by(mutant.room)
-            verdict = judged(mutant, covered[mutant.room])
+            of_room = covered[mutant.room]
+            tests = of_room.of(mutant, options.seconds)
+            verdict = judged(mutant, tests, sum(of_room.seconds[test] for test in tests))
             kept.keep(mutant, verdict)
         verdicts.append((mutant, verdict))
         print(

@@ -94,6 +94,9 @@ def test_a_mutant_meets_the_tests_that_run_its_statement(module: Path) -> None:
     seconds = {"tests/a.py::slow": 2.0, "tests/b.py::quick": 0.1, "tests/b.py::other": 1.0}
     covered = mutants.Covered({name: ran}, seconds)
     within = Mutant(name, "core/NumberReplacer", 0, 3)
-    assert covered.of(within) == ["tests/b.py::quick", "tests/a.py::slow"]
-    assert covered.of(within._replace(line=5)) == ["tests/b.py::quick"]
-    assert covered.of(within._replace(line=6)) == []
+    assert covered.of(within, 60.0) == ["tests/b.py::quick", "tests/a.py::slow"]
+    assert covered.of(within, 1.0) == ["tests/b.py::quick"]
+    assert covered.of(within, 0.0) == ["tests/b.py::quick"]
+    assert covered.of(within._replace(line=5), 60.0) == ["tests/b.py::quick"]
+    anywhere = ["tests/b.py::other", "tests/b.py::quick", "tests/a.py::slow"]
+    assert covered.of(within._replace(line=6), 60.0) == anywhere
