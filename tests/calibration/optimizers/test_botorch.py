@@ -68,6 +68,11 @@ def test_modelled_values_keep_the_order_of_losses_and_are_finite() -> None:
     assert bool((values.diff(dim=1) <= 0).all())
 
 
+def test_a_process_begins_with_the_guesses_and_the_best_of_the_others() -> None:
+    losses = torch.tensor([[9.0, 8.0, 3.0, 1.0, 2.0, 4.0], [0.0, 0.0, 1.0, 2.0, 3.0, 4.0]])
+    assert botorch._best_of(losses, 2, 4).tolist() == [[0, 1, 3, 4], [0, 1, 2, 3]]
+
+
 def test_screening_helps_in_ten_dimensions() -> None:
     optima = torch.rand(12, 10, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     guesses = torch.full((12, 1, 10), 0.5, dtype=torch.float64)
