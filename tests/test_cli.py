@@ -149,8 +149,8 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
             "'data.columns.pairid'. Did you mean 'data.columns.pair_id'? Known keys of",
         ),
         (
-            ["model.parameters={A: 1}"],
-            "To replace all of them: '~model.parameters' '+model.parameters={A: 1}'",
+            ["model.parameters={X: 1}"],
+            "To replace all of them: '~model.parameters' '+model.parameters={X: 1}'",
         ),
         (["modle=w99", "policy=nope"], "policy=nope: there is no policy 'nope'."),
         (["seed=-1"], "seed=-1: should be greater than or equal to 0."),

@@ -234,7 +234,7 @@ def fitted_errors(errors: Mapping[str, float]) -> dict[str, float]:
 
 
 def interval_in_words(low: float, high: float, unit: str = "") -> str:
-    """Returns an improvement's interval in percent: "-1.2 to +3.4"; "one driver" if there is none.
+    """Returns an improvement's interval in percent, or "one driver" where there is none.
 
     That of two or three drivers may begin anywhere: "below -1000" is all that is said of it.
     """

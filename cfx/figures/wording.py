@@ -144,7 +144,7 @@ def percent(fraction: float, digits: int = 0) -> str:
 
 
 def percent_interval(low: float, high: float) -> str:
-    """Returns an interval of signed percentages with real minus signs: "+1.2 % to +3.4 %"."""
+    """Returns an interval of signed percentages with real minus signs."""
     return interval_in_words(low, high, " %").replace("-", MINUS)
 
 
