@@ -149,6 +149,10 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
             "'data.columns.pairid'. Did you mean 'data.columns.pair_id'? Known keys of",
         ),
         (
+            ["model.parameters={A: 1}"],
+            "there is no key 'model.parameters.A'. Did you mean 'model.parameters.a'?",
+        ),
+        (
             ["model.parameters={X: 1}"],
             "To replace all of them: '~model.parameters' '+model.parameters={X: 1}'",
         ),

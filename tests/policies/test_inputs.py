@@ -54,8 +54,8 @@ def test_measured_frames_have_the_further_signals_as_recorded() -> None:
 
 
 def test_what_has_a_pole_is_bounded_there() -> None:
-    one = torch.ones(1, dtype=torch.float64)
-    standing = {"follower_speed": 0.0 * one, "leader_speed": 2.0 * one, "gap": 0.1 * one}
+    values = {"follower_speed": 0.0, "leader_speed": 2.0, "gap": 0.1}
+    standing = {name: torch.tensor([value]).double() for name, value in values.items()}
     assert TimeHeadway().values(standing).item() == pytest.approx(0.1)
     assert InverseTimeToCollision().values(standing).item() == pytest.approx(-2.0)
 

@@ -264,4 +264,5 @@ def _gain(job: Result, baseline: str) -> str:
         certainty = f"95 % interval {wording.percent_interval(low, high)}"
     gain = f"{wording.percent(improvement.geometric, 1)} ({certainty})"
     note = headline.summaries_disagree(improvement.geometric, improvement.ratio_of_means)
-    return f"{gain}, {note}".replace("-", wording.MINUS) if note else gain
+    note = note.replace("-", wording.MINUS)
+    return f"{gain}, {note}" if note else gain

@@ -83,18 +83,18 @@ def test_screening_helps_in_ten_dimensions() -> None:
 
 
 def test_the_first_process_is_fitted_longer_and_later_ones_go_on_from_it() -> None:
-    def asked(**steps: int) -> Tensor:
+    def candidates_of(**steps: int) -> Tensor:
         problems = Problems(distance, torch.tensor([[0.1, 0.7]], dtype=torch.float64))
         guesses = torch.full((1, 1, 2), 0.5, dtype=torch.float64)
         optimizer = BotorchOptimizer(screening=0, iterations=2, **steps)
         optimizer.minimize(problems, guesses, seed=0)
         return torch.cat([candidates[0] for candidates in problems.asked])
 
-    usual = asked(first_fit_steps=20, fit_steps=2)
-    later = asked(first_fit_steps=20, fit_steps=20)
+    usual = candidates_of(first_fit_steps=20, fit_steps=2)
+    later = candidates_of(first_fit_steps=20, fit_steps=20)
     assert torch.equal(usual[:-1], later[:-1])
     assert not torch.equal(usual[-1], later[-1])
-    assert not torch.equal(usual[-2], asked(first_fit_steps=2, fit_steps=2)[-2])
+    assert not torch.equal(usual[-2], candidates_of(first_fit_steps=2, fit_steps=2)[-2])
 
 
 def test_more_guesses_than_initial_evaluations_is_told() -> None:

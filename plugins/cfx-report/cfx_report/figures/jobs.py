@@ -104,11 +104,8 @@ def draw_overview(
         drawn = axes.errorbar(
             [centre], [place], xerr=reach, color=colour, marker="o", markersize=8, capsize=4
         )
-        low, high = (
-            wording.percent_or_undefined(row.ci95_low, 1),
-            wording.percent_or_undefined(row.ci95_high, 1),
-        )
-        said = f"{job}: {wording.percent_or_undefined(centre, 1)}, 95 % interval {low} to {high}"
+        interval = wording.percent_interval(row.ci95_low, row.ci95_high)
+        said = f"{job}: {wording.percent_or_undefined(centre, 1)}, 95 % interval {interval}"
         canvas.hover(drawn.lines[0], said)
         for name, value, marker in (
             ("of the mean errors", row.ratio_of_means, "D"),

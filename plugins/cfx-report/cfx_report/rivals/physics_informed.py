@@ -53,11 +53,8 @@ class PhysicsInformed(Rival):
         s = self.settings
         states, actions, weights = _moments(pairs)
         model = cast(DrivingModel, registry.create("model", {"name": "idm"}))
-        bounds = (
-            torch.tensor([[parameter.low, parameter.high] for parameter in model.space.tuned])
-            .double()
-            .T
-        )
+        ranges = [[parameter.low, parameter.high] for parameter in model.space.tuned]
+        bounds = torch.tensor(ranges).double().T
         with torch.random.fork_rng(devices=[]), threads.one_thread():
             torch.manual_seed(seed)
             module = nn.Sequential(

@@ -278,7 +278,7 @@ STATISTICS: tuple[Column[Any], ...] = (
         "Drivers of these pairs.",
     ),
 )
-"""Of rows with an `Improvement`, `improvement`."""
+"""Columns of rows that have an `improvement`."""
 
 
 class SafetySection(Section):
