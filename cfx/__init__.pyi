@@ -10,6 +10,7 @@ from .api.experiment import model as model
 from .api.experiment import train as train
 from .api.fit import Fit as Fit
 from .api.fit import calibrate as calibrate
+from .api.fit import calibrate_pooled as calibrate_pooled
 from .api.fit import compare as compare
 from .api.forecasts import Forecast as Forecast
 from .api.forecasts import forecast as forecast

@@ -5,6 +5,7 @@ Shapes: P pairs, n tuned parameters.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -93,12 +94,9 @@ class Fit:
         import torch
 
         members = torch.ones((1, len(self._context.pairs)), dtype=torch.bool)
-        context = self._context
         with visit():
-            parameters = context.calibrator.pooled(
-                context.pairs, context.batch, self._last, members
-            )
-        return pd.Series(parameters[0].tolist(), index=self.parameters.columns, name="pooled")
+            table = _pooled_over(self._context, self._last, members, ["pooled"])
+        return pd.Series(table.iloc[0], name="pooled")
 
     @property
     def defaults(self) -> pd.Series:
@@ -403,6 +401,11 @@ _NOT_TRAINED = {
 }
 """Settings that do nothing in a calibration, and why."""
 
+_NOT_POOLED = {
+    "calibration.posterior": "intervals are of driver-specific parameters",
+}
+"""Settings that do nothing where parameters are pooled alone, and why."""
+
 
 def calibrate(
     pairs: PairsLike,
@@ -459,6 +462,96 @@ def calibrate(
     table = pd.DataFrame(calibrated.cpu().numpy(), ids, list(context.space.names))
     apart = pd.Series(context.calibrator.apart(context.pairs, last), ids, name="ends_apart")
     return Fit(experiment, recording, table, apart, context, last)
+
+
+def calibrate_pooled(
+    pairs: PairsLike,
+    model: str = "idm",
+    groups: Mapping[str, PairIds] | None = None,
+    *,
+    objective: str = "speed_rmse",
+    seed: int = 0,
+    **settings: Any,
+) -> pd.DataFrame:
+    """Calibrates one set of constant parameters for all drivers, or one for each group of them.
+
+    It minimises the mean of the pairs' losses, on whole trajectories. Driver-specific parameters
+    are not calibrated. Nothing is written.
+
+    Args:
+        pairs: as `cfx.read` takes them.
+        model: as after `model=`.
+        groups: the ids of the pairs of each group, by its name; a pair may be in several. None: all
+            pairs are one group, `all`.
+        objective: what is minimised, as after `objective=`: `speed_rmse`, `gap_rmse`, ...
+        seed: the same seed gives the same parameters.
+        settings: others of the command line, as for `calibrate`; `split=0.8` keeps the last part of
+            each trajectory back.
+
+    Returns:
+        A row per group: its parameters, SI units.
+
+    Raises:
+        CfxError: the pairs, a group or a setting are wrong, in one sentence.
+
+    Examples:
+        >>> import cfx
+        >>> pairs = cfx.read(dataset="synthetic", pairs=3, frames=200, variation=0.0)
+        >>> first, second, third = pairs.summary.index
+        >>> table = cfx.calibrate_pooled(pairs, "idm", {"two": [first, second], "one": third})
+        >>> table.shape
+        (2, 5)
+    """
+    import torch
+
+    refuse_unused(settings, {**NOTHING_KEPT, **_NOT_TRAINED, **_NOT_POOLED})
+    chosen = {"model": model, "objective": objective, "seed": seed, "split": 1.0}
+    chosen |= without_data(settings)
+    recording = pairs_from(pairs, settings)
+    experiment = config(recording, policy="fixed", protocol="within_driver", **chosen)
+    with visit():
+        components, context, last = _context_of(experiment, recording)
+        with closing(components.engine):
+            ids = list(context.pairs.ids)
+            members = torch.ones((1, len(ids)), dtype=torch.bool)
+            if groups is not None:
+                members = _members_of(groups, ids)
+            return _pooled_over(context, last, members, ["all"] if groups is None else list(groups))
+
+
+def _members_of(groups: Mapping[str, PairIds], ids: Sequence[str]) -> Tensor:
+    """Returns which of P pairs belong to each of K groups, `(K, P)` bool.
+
+    Raises:
+        DataError: there is no group, one is empty, or it names a pair that is not there.
+    """
+    import torch
+
+    if not groups:
+        raise DataError("groups: there is none; leave it out to pool over all pairs")
+    members = torch.zeros((len(groups), len(ids)), dtype=torch.bool)
+    row_of = {pair_id: number for number, pair_id in enumerate(ids)}
+    for number, (name, pair_ids) in enumerate(groups.items()):
+        chosen = chosen_names(pair_ids, ids, f"group '{name}'")
+        if not chosen:
+            raise DataError(f"group '{name}' has no pairs; leave it out")
+        members[number, [row_of[pair_id] for pair_id in chosen]] = True
+    return members
+
+
+def _pooled_over(
+    context: ProtocolContext, last: Tensor, members: Tensor, names: Sequence[str]
+) -> pd.DataFrame:
+    """Returns the pooled parameters of K groups of pairs, a row each.
+
+    Args:
+        context: of a calibration of P pairs.
+        last: `(P,)`, the last frame that is used of each.
+        members: `(K, P)` bool.
+        names: of the groups.
+    """
+    parameters = context.calibrator.pooled(context.pairs, context.batch, last, members)
+    return pd.DataFrame(parameters.cpu().numpy(), list(names), list(context.space.names))
 
 
 def _context_of(

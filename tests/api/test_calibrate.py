@@ -97,6 +97,39 @@ def test_driver_specific_parameters_have_the_lowest_loss(fit: cfx.Fit) -> None:
     assert train["driver_specific"] <= train["pooled"] <= train["default"]
 
 
+def test_groups_are_pooled_beside_one_another_as_each_alone(pairs: cfx.Pairs) -> None:
+    first, second, third = pairs.summary.index
+    groups = {"all": [first, second, third], "two": [third, first], "one": second}
+    table = cfx.calibrate_pooled(pairs, "idm", groups, objective="gap_rmse", seed=3, **RANDOM)
+    assert list(table.index) == ["all", "two", "one"]
+    alone = cfx.calibrate_pooled(pairs.select([second]), objective="gap_rmse", seed=3, **RANDOM)
+    assert table.loc["one"].tolist() == alone.loc["all"].tolist()
+    whole = cfx.calibrate(pairs, objective="gap_rmse", seed=3, split=1.0, **RANDOM)
+    assert table.loc["all"].tolist() == whole.pooled.tolist()
+    shorter = cfx.calibrate_pooled(pairs, objective="gap_rmse", seed=3, split=0.5, **RANDOM)
+    assert shorter.loc["all"].tolist() != whole.pooled.tolist()
+
+
+@pytest.mark.parametrize(
+    ("groups", "said"),
+    [
+        ({"mine": ["nobody"]}, "group 'mine': there is no pair 'nobody'"),
+        ({"mine": []}, "group 'mine' has no pairs"),
+        ({}, "groups: there is none"),
+    ],
+)
+def test_groups_that_cannot_be_pooled_are_said(
+    pairs: cfx.Pairs, groups: dict[str, list[str]], said: str
+) -> None:
+    with pytest.raises(DataError, match=said):
+        cfx.calibrate_pooled(pairs, "idm", groups)
+
+
+def test_pooled_parameters_have_no_posterior(pairs: cfx.Pairs) -> None:
+    with pytest.raises(ConfigError, match="intervals are of driver-specific parameters"):
+        cfx.calibrate_pooled(pairs, "idm", **{"calibration.posterior": "laplace"})
+
+
 def test_a_summary_has_units_defaults_and_pooled_values(fit: cfx.Fit) -> None:
     table = fit.summary
     assert table.loc["T", ["unit", "default"]].tolist() == ["s", 1.6]

@@ -11,6 +11,7 @@ import yaml
 from cfx.errors import ConfigError
 from cfx.plugin import folder_of as folder_of_run
 from cfx.plugin import load_agent, registry
+from cfx_report.benchmark.constants import are_constant
 from cfx_report.benchmark.jobs import (
     as_file_name,
     of_method,
@@ -18,7 +19,13 @@ from cfx_report.benchmark.jobs import (
     require_free,
     row_name,
 )
-from cfx_report.benchmark.methods import Entry, JobEntry, ReadyEntry, RivalEntry
+from cfx_report.benchmark.methods import (
+    ConstantEntry,
+    Entry,
+    JobEntry,
+    ReadyEntry,
+    RivalEntry,
+)
 from cfx_report.benchmark.rival import Rival
 from cfx_report.benchmark.suite import Suite
 
@@ -52,7 +59,8 @@ def entry_of(method: str | None, overrides: Sequence[str], name: str | None, see
     require_free(overrides)
     words = overrides_of(method, overrides)
     row = name or row_name(method, overrides) + suffix
-    return JobEntry(row, tuple(of_method(words)), tuple(words))
+    made = ConstantEntry if are_constant(words) else JobEntry
+    return made(row, tuple(of_method(words)), tuple(words))
 
 
 def _rival(overrides: Sequence[str]) -> Rival:

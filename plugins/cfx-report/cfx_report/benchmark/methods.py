@@ -1,7 +1,8 @@
 """Who may enter the benchmark: cfx's own methods, by jobs, and rivals, fold by fold.
 
-An entry gives a driver for each fold. Models and policies of cfx are calibrated and trained by one
-job for each scheme, all folds at once; a rival learns from the pairs of one fold after the other.
+An entry gives a driver for each fold. Constant parameters are pooled for all folds of a scheme at
+once, and policies of cfx are trained so by one job; a rival learns from the pairs of one fold after
+the other.
 
 Shapes: P pairs, T frames, n tuned parameters.
 """
@@ -9,7 +10,7 @@ Shapes: P pairs, T frames, n tuned parameters.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast
@@ -25,18 +26,16 @@ from cfx.plugin import (
     DrivingModel,
     FixedPolicy,
     Followers,
-    Leader,
     MemoryStepper,
     PairBatch,
     PairSet,
-    Start,
     base_of,
     files,
     forecasts,
     load_agent,
     registry,
-    simulate_follower,
 )
+from cfx_report.benchmark.constants import ConstantDriver, calibration_settings
 from cfx_report.benchmark.frozen import HISTORY
 from cfx_report.benchmark.jobs import run_job
 from cfx_report.benchmark.rival import Driver, Rival, on_frames
@@ -138,6 +137,44 @@ class ReadyEntry(Entry):
 
 
 @dataclass(frozen=True)
+class ConstantEntry(Entry):
+    """A model with constant parameters, pooled over the drivers that a fold learns from.
+
+    All folds of a scheme are pooled at once, since they have candidates in common.
+
+    Attributes:
+        overrides: the words, and those that change no result.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    overrides: tuple[str, ...]
+
+    def driver(self, training: Training, number: int) -> Driver:
+        found = training.folder / f"pooled_{training.scheme.name}.parquet"
+        if not found.is_file():
+            groups = {}
+            for fold in range(training.folds):
+                groups[str(fold)] = training.learned(fold).ids
+            table = self._pooled(training.pairs, training.seed, groups)
+            with files.atomic_write(found) as temporary:
+                table.to_parquet(temporary)
+        return self._driver(pd.read_parquet(found).loc[[str(number)]])
+
+    def learned(self, pairs: PairSet, seed: int) -> Driver:
+        return self._driver(self._pooled(pairs, seed))
+
+    def _pooled(
+        self, pairs: PairSet, seed: int, groups: Mapping[str, Sequence[str]] | None = None
+    ) -> pd.DataFrame:
+        settings = calibration_settings(self.overrides)
+        return cfx.calibrate_pooled(pairs, groups=groups, seed=seed, **settings)
+
+    def _driver(self, parameters: pd.DataFrame) -> Driver:
+        return ConstantDriver(calibration_settings(self.overrides), parameters)
+
+
+@dataclass(frozen=True)
 class JobEntry(Entry):
     """A model or a policy of cfx: the overrides of a job.
 
@@ -154,25 +191,12 @@ class JobEntry(Entry):
         agent = load_agent(job / "policy")
         if agent.names[number] != f"fold {number}":
             raise DataError(f"{job}: has no policy for each fold; its protocol is another one")
-        return AgentDriver(agent, number, self._settings)
+        return AgentDriver(agent, number, calibration_settings(self.overrides))
 
     def learned(self, pairs: PairSet, seed: int) -> Driver:
-        if "policy=fixed" not in self.words:
-            raise ConfigError(
-                f"{' '.join(self.words)}: only a job trains it: run that, and give driver=FOLDER"
-            )
-        fit = cfx.calibrate(pairs, split=1.0, seed=seed, **self._settings)
-        return AgentDriver(fit.policy, 0, self._settings)
-
-    @property
-    def _settings(self) -> dict[str, Any]:
-        """The words that `cfx.calibrate` takes."""
-        settings: dict[str, Any] = {}
-        for word in self.words:
-            key, _, value = word.partition("=")
-            if key.split(".")[0] in {"model", "objective", "optimizer", "calibration"}:
-                settings[key] = value
-        return settings
+        raise ConfigError(
+            f"{' '.join(self.words)}: only a job trains it: run that, and give driver=FOLDER"
+        )
 
     def job(self, training: Training) -> Path:
         """Runs the job of a scheme, or finds it finished; returns its folder.
@@ -230,13 +254,7 @@ class AgentDriver(Driver):
         self._driver_specific = driver_specific
         self._model = cast(DrivingModel, registry.create("model", agent.model_node))
 
-    @property
-    def _is_constant(self) -> bool:
-        return isinstance(self.agent.core.policy, FixedPolicy)
-
     def drive(self, batch: PairBatch, first: Tensor, seed: int | None) -> Tensor:
-        if self._driver_specific is not None and self._is_constant:
-            return self._with_driver_specific(batch, first)
         base = None
         if self._driver_specific is not None:
             base = base_of(self.agent, self._driver_specific)
@@ -257,28 +275,13 @@ class AgentDriver(Driver):
         )
         return on_frames(paths.speed[0], batch, first)
 
-    def _with_driver_specific(self, batch: PairBatch, first: Tensor) -> Tensor:
-        """Drives each follower with constant parameters of their own."""
-        columns = torch.arange(int((batch.lengths - first).max()))
-        index = (first[:, None] + columns).clamp(max=batch.mask.shape[1] - 1)
-        start = []
-        for name in ("position", "speed", "acceleration"):
-            start.append(getattr(batch, f"follower_{name}").gather(1, first[:, None])[:, 0])
-        leader = Leader(
-            batch.leader_position.gather(1, index),
-            batch.leader_speed.gather(1, index),
-            batch.leader_acceleration.gather(1, index),
-            batch.leader_length,
-        )
-        driven = simulate_follower(
-            self._model, self._driver_specific, leader, Start(*start), batch.dt
-        )
-        return on_frames(driven.speed, batch, first)
-
     def adapted(self, past: PairSet, seed: int) -> Driver:
         """Calibrates driver-specific parameters on their past, where they drive or are a base."""
-        if not (self._is_constant or self.agent.context_rule.driver_specific):
+        is_constant = isinstance(self.agent.core.policy, FixedPolicy)
+        if not (is_constant or self.agent.context_rule.driver_specific):
             return self
         fit = cfx.calibrate(past, split=1.0, seed=seed, **self._settings)
+        if is_constant:
+            return ConstantDriver(self._settings, fit.parameters)
         values = torch.tensor(fit.parameters.to_numpy(dtype="float64"))
         return AgentDriver(self.agent, self.number, self._settings, values)

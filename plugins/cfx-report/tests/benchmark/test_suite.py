@@ -22,7 +22,13 @@ from cfx_report.benchmark.board import Entered, lines_of_rows, standings, write_
 from cfx_report.benchmark.entries import entry_of
 from cfx_report.benchmark.everything import commands
 from cfx_report.benchmark.leaderboard import render
-from cfx_report.benchmark.methods import JobEntry, ReadyEntry, RivalEntry, Training
+from cfx_report.benchmark.methods import (
+    ConstantEntry,
+    JobEntry,
+    ReadyEntry,
+    RivalEntry,
+    Training,
+)
 from cfx_report.benchmark.predictions import FORECASTS, TRAJECTORIES, read
 from cfx_report.benchmark.rival import Driver, Rival, Seen, StepDriver
 from cfx_report.benchmark.roads import QUICK, ROADS
@@ -455,6 +461,11 @@ def test_what_enters(monkeypatch: pytest.MonkeyPatch) -> None:
         ("experiment=unseen_drivers", "model=idm"),
     )
     assert job.overrides == (*job.words, "tracking.enabled=false")
+    constant = entry_of(None, ["model=idm", "optimizer.samples=64", "cores=1"], None, 0)
+    assert isinstance(constant, ConstantEntry)
+    assert constant.words == ("policy=fixed", "model=idm", "optimizer.samples=64")
+    needs_job = entry_of(None, ["model=idm", "tracking.enabled=false"], None, 0)
+    assert isinstance(needs_job, JobEntry)
     ready = entry_of(None, ["driver=cfx://idm"], None, 0)
     assert isinstance(ready, ReadyEntry)
     for words, said in (
@@ -465,6 +476,22 @@ def test_what_enters(monkeypatch: pytest.MonkeyPatch) -> None:
     ):
         with pytest.raises(CfxError, match=said):
             entry_of(None, words, None, 0)
+
+
+def test_constant_parameters_are_those_of_a_job(recordings: Recordings, tmp_path: Path) -> None:
+    """A job calibrates driver-specific parameters too, and tests and draws; they are not asked."""
+    some = ("policy=fixed", "model=idm", "optimizer=random", "optimizer.samples=32")
+    settings = (*some, "calibration.prior=weak")
+    quiet = ("tracking.enabled=false", "figures=none")
+    tables = {}
+    for name, entry in (
+        ("alone", ConstantEntry("alone", settings, settings)),
+        ("job", JobEntry("job", settings, (*settings, *quiet))),
+    ):
+        make_row(entry, recordings, tmp_path / name, 0)
+        tables[name] = pd.read_csv(tmp_path / name / "benchmark_pairs.csv").drop(columns="row")
+    pd.testing.assert_frame_equal(tables["alone"], tables["job"], check_exact=True)
+    assert not (tmp_path / "alone/jobs").exists()
 
 
 def test_all_rows_have_a_command_each(monkeypatch: pytest.MonkeyPatch) -> None:
