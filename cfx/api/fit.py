@@ -467,7 +467,7 @@ def calibrate(
 def calibrate_pooled(
     pairs: PairsLike,
     model: str = "idm",
-    groups: Mapping[str, PairIds] | None = None,
+    groups: Mapping[str, PairIds] | pd.Series | None = None,
     *,
     objective: str = "speed_rmse",
     seed: int = 0,
@@ -481,8 +481,9 @@ def calibrate_pooled(
     Args:
         pairs: as `cfx.read` takes them.
         model: as after `model=`.
-        groups: the ids of the pairs of each group, by its name; a pair may be in several. None: all
-            pairs are one group, `all`.
+        groups: the ids of the pairs of each group, by its name, such as
+            `pairs.frame.groupby("driver_type")["pair_id"].unique()`; a pair may be in several.
+            None: all pairs are one group, `all`.
         objective: what is minimised, as after `objective=`: `speed_rmse`, `gap_rmse`, ...
         seed: the same seed gives the same parameters.
         settings: others of the command line, as for `calibrate`; `split=0.8` keeps the last part of
@@ -502,8 +503,6 @@ def calibrate_pooled(
         >>> table.shape
         (2, 5)
     """
-    import torch
-
     refuse_unused(settings, {**NOTHING_KEPT, **_NOT_TRAINED, **_NOT_POOLED})
     chosen = {"model": model, "objective": objective, "seed": seed, "split": 1.0}
     chosen |= without_data(settings)
@@ -513,10 +512,8 @@ def calibrate_pooled(
         components, context, last = _context_of(experiment, recording)
         with closing(components.engine):
             ids = list(context.pairs.ids)
-            members = torch.ones((1, len(ids)), dtype=torch.bool)
-            if groups is not None:
-                members = _members_of(groups, ids)
-            return _pooled_over(context, last, members, ["all"] if groups is None else list(groups))
+            named = {"all": ids} if groups is None else dict(groups)
+            return _pooled_over(context, last, _members_of(named, ids), list(named))
 
 
 def _members_of(groups: Mapping[str, PairIds], ids: Sequence[str]) -> Tensor:
