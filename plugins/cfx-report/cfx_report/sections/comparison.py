@@ -326,8 +326,8 @@ it holds for other drivers, the intervals of each job say.</p>
 def over_seeds(rows: Sequence[Row]) -> Sheet:
     """Returns a row per group of jobs: errors of each method, and the policy's improvement."""
     where = tested(chain.from_iterable(row.jobs for row in rows))
-    columns = [
-        Column[Row](
+    columns: list[Column[Row]] = [
+        Column(
             "Jobs", lambda row: row.name, "Named by what differs between them, without the seed."
         ),
         Column("Seeds", lambda row: number(len(row.jobs), "d"), "Jobs of the row."),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 import pandas as pd
@@ -88,8 +88,8 @@ def _view(jobs: Sequence[Result], tables: Sequence[pd.DataFrame], baseline: str)
 
 def pairs_of(job: Result) -> Sheet:
     """Returns a row per pair of a job: its driver, improvements and errors."""
-    columns = [
-        Column[Pair]("Pair", lambda row: str(row["pair_id"])),
+    columns: list[Column[Pair]] = [
+        Column("Pair", lambda row: str(row["pair_id"])),
         Column("Driver", lambda row: str(row["driver"])),
         Column("Cluster", lambda row: str(row["cluster"])),
         Column("Style score", partial(_value, "style_score"), "0 conservative, 1 aggressive."),
@@ -105,7 +105,8 @@ def pairs_of(job: Result) -> Sheet:
     for method in job.methods:
         cell = partial(_errors_of_pair, method)
         columns.append(Column(wording.short_label(method), cell, f"{errors}.", errors))
-    return Sheet.of(columns, job.by_pair.to_dict("records"))
+    # Columns of a data frame may be named by anything; these are named by text.
+    return Sheet.of(columns, cast("list[Pair]", job.by_pair.to_dict("records")))
 
 
 def _value(name: str, row: Pair, form: str = ".3f", second: str = "") -> Cell:

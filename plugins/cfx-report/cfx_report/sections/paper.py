@@ -69,7 +69,7 @@ def comparison(about: Mapping[str, Any], jobs: Sequence[Result]) -> Sheet:
     for job in jobs:
         values = [value_of(job, column["value"]) for column in about["columns"]]
         rows.append((f"here: {job.name}", *values))
-    columns = [Column[Sequence[Any]]("", itemgetter(0))]
+    columns: list[Column[Sequence[Any]]] = [Column("", itemgetter(0))]
     for place, column in enumerate(about["columns"], start=1):
         cell = partial(_cell, place, column.get("form", ""))
         columns.append(Column(column["heading"], cell, column.get("meaning", "")))

@@ -94,12 +94,13 @@ def errors(jobs: Sequence[Result]) -> Sheet:
     for job in jobs:
         methods += job.methods
         rows += [_Tested(job, method) for method in job.shown_methods]
-    judge, leading = judge_of(jobs), []
+    judge = judge_of(jobs)
+    leading: list[Column[_Tested]] = []
     if judge.name not in {"rmse_speed", "rmse_gap"}:
         cell = partial(_metric, judge.name)
-        leading.append(Column[_Tested](metric_title(judge), cell, f"{judge.meaning}."))
-    columns = [
-        Column[_Tested]("Job", lambda row: row.job.name),
+        leading.append(Column(metric_title(judge), cell, f"{judge.meaning}."))
+    columns: list[Column[_Tested]] = [
+        Column("Job", lambda row: row.job.name),
         Column("Method", lambda row: method_cell(row.method), methods_explained(methods)),
         Column(
             "Pairs",
@@ -204,8 +205,8 @@ def improvements(jobs: Sequence[Result]) -> Sheet:
                 if baseline in job.baselines(scope):
                     improvement = job.statistics(baseline, scope)
                     rows.append(_Compared(job.name, baseline, scope, improvement))
-    columns = [
-        Column[_Compared]("Job", lambda row: row.job),
+    columns: list[Column[_Compared]] = [
+        Column("Job", lambda row: row.job),
         Column(
             "Policy against",
             lambda row: method_cell(row.baseline),
@@ -345,8 +346,8 @@ _SAFETY = (
 
 def safety_of_methods(jobs: Sequence[Result]) -> Sheet:
     """Returns a row per job and method, with the recorded drivers for comparison."""
-    columns = [
-        Column[_Driven]("Job", lambda row: row.job.name),
+    columns: list[Column[_Driven]] = [
+        Column("Job", lambda row: row.job.name),
         Column(
             "Driven by",
             lambda row: method_cell(row.method),
@@ -409,8 +410,8 @@ def all_metrics(job: Result) -> Sheet:
     methods = list(job.shown_methods)
     if any(key.endswith("/real") for key in job.metrics):
         methods.insert(0, "real")
-    columns = [
-        Column[_Measured]("Metric", lambda row: metric_title(row.metric)),
+    columns: list[Column[_Measured]] = [
+        Column("Metric", lambda row: metric_title(row.metric)),
         Column("Frames", lambda row: job.scope_label(row.scope)),
         Column("Over pairs", lambda row: row.metric.summary),
         Column("Better", lambda row: row.metric.direction.replace("none", "")),
