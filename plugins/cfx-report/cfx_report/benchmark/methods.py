@@ -157,6 +157,7 @@ class ConstantEntry(Entry):
             for fold in range(training.folds):
                 groups[str(fold)] = training.learned(fold).ids
             table = self._pooled(training.pairs, training.seed, groups)
+            training.folder.mkdir(parents=True, exist_ok=True)
             with files.atomic_write(found) as temporary:
                 table.to_parquet(temporary)
         return self._driver(pd.read_parquet(found).loc[[str(number)]])

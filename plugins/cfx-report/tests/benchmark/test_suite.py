@@ -449,6 +449,17 @@ def test_an_opencf_submission(recordings: Recordings, tmp_path: Path) -> None:
         opencf.read_opencf(tmp_path / "bad.csv")
 
 
+def test_constant_parameters_are_watched_before_a_row_of_them_is_made(
+    recordings: Recordings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(watching, "_LEAST_S", 2.0)
+    settings = ("model=idm", "optimizer=random", "optimizer.samples=32", "calibration.prior=weak")
+    entry = ConstantEntry("idm", settings, settings)
+    errors = watching.watch(entry, recordings, tmp_path / "new", 0, (0.0, 5.0))
+    by_seconds = errors.pivot_table("rmse_speed", "pair_id", "watched_s")
+    assert (by_seconds[0.0] != by_seconds[5.0]).all()
+
+
 def test_what_enters(monkeypatch: pytest.MonkeyPatch) -> None:
     cfx.core.registry.add("rival", "keeps", KeepsRival)
     entry = entry_of(None, ["rival=keeps"], None, 1)
