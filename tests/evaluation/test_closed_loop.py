@@ -113,16 +113,17 @@ def test_constant_parameters_are_the_plain_rollout() -> None:
     torch.testing.assert_close(loop.parameters, parameters[:, None].expand_as(loop.parameters))
 
 
-def closed_loop_of(batch: PairBatch, model: DrivingModel, first: Tensor) -> ClosedLoop:
+def closed_loop_of(
+    batch: PairBatch, model: DrivingModel, first: Tensor, history: float | None = None
+) -> ClosedLoop:
     policy = adaptive(
         model,
         GruPolicy(start="middle", inputs=("leader_speed", "follower_speed", "gap")),
         len(batch),
         15,
     )
-    return simulate_closed_loop(
-        MemoryStepper(model, 0.1), policy, Followers(batch, torch.arange(len(batch))), first
-    )
+    followers = Followers(batch, torch.arange(len(batch)), history=history)
+    return simulate_closed_loop(MemoryStepper(model, 0.1), policy, followers, first)
 
 
 def test_the_policy_never_sees_the_measured_follower_of_the_test_part() -> None:
@@ -160,6 +161,21 @@ def test_the_policy_observes_the_history_first() -> None:
     )
     after = closed_loop_of(changed, model, first)
     assert not torch.equal(before.parameters, after.parameters)
+
+
+def test_the_policy_observes_so_many_seconds_before_the_test() -> None:
+    model = Krauss()
+    parameters = torch.tensor([[1.5, 0.1], [3.0, 0.5]], dtype=torch.float64)
+    batch = PairBatch.of(wavy_pairs(model, parameters))
+    first, frame = torch.tensor([150, 200]), torch.arange(batch.mask.shape[1])
+    loops = []
+    for earlier_than_s in (5.5, 3.0):  # the first window holds half a second before
+        is_changed = frame < first[:, None] - round(earlier_than_s / 0.1)
+        changed = replace(batch, leader_speed=torch.where(is_changed, 1.0, batch.leader_speed))
+        loops.append(closed_loop_of(changed, model, first, history=5.0))
+    unchanged = closed_loop_of(batch, model, first, history=5.0)
+    assert torch.equal(loops[0].parameters, unchanged.parameters)
+    assert not torch.equal(loops[1].parameters, unchanged.parameters)
 
 
 def test_a_pair_drives_the_same_whatever_drives_beside_it() -> None:

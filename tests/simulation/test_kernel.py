@@ -484,7 +484,7 @@ class AddsScaled(Krauss):
         self, follower: Follower, leader: Leader, p: Mapping[str, Tensor], dt: float
     ) -> Tensor:
         speed = super().next_speed(follower, leader, p, dt)
-        return torch.sub(torch.add(speed, p["t_i"], alpha=2), p["t_i"], alpha=3)
+        return torch.sub(torch.add(speed, p["t_i"], alpha=0.5), p["t_i"], alpha=3)
 
 
 class SplitsAlike(Krauss):
