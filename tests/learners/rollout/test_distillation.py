@@ -17,12 +17,12 @@ from cfx.policies.heads.offset import OffsetHead
 from tests.learners.made import WINDOWS, batch_of, gru, module_of, training_data
 
 
-def distilled_module(data: TrainingData, **options: Any) -> RolloutModule:
+def distilled_module(data: TrainingData, *, seed: int = 1, **options: Any) -> RolloutModule:
     """A module whose untrained students imitate untrained experts that answer at random."""
     module = module_of(data, **options)
     dataset = module.dataset.for_base(torch.tensor([0.6]))
     blank = torch.full((len(dataset.pair), 1), 0.5)
-    features, generator = dataset.scaler.mean.shape[-1], torch.Generator().manual_seed(1)
+    features, generator = dataset.scaler.mean.shape[-1], torch.Generator().manual_seed(seed)
     network = gru(start="middle").build(features, blank[0], blank, generator)
     network.requires_grad_(False)
     core = AgentCore(gru(), network, dataset.scaler, OffsetHead.for_model(Direct()))
@@ -61,13 +61,16 @@ def test_a_student_learns_from_each_window_alone() -> None:
     data = training_data(networks=1)
     options = {"distillation_epochs": 1, "cold_start_fraction": 0.0}
     gradients, losses = [], []
-    for module in (distilled_module(data, **options), module_of(data, **options)):
+    other_expert = distilled_module(data, seed=2, **options)
+    for module in (distilled_module(data, **options), module_of(data, **options), other_expert):
         loss = next(module.step_losses(0))
         loss.sum().backward()
         losses.append(loss.detach())
         gradients.append(module.network.get_parameter("b_out").grad)
     torch.testing.assert_close(losses[0], losses[1])
     assert not torch.allclose(gradients[0], gradients[1], rtol=0.1)
+    torch.testing.assert_close(losses[0], losses[2])
+    assert not torch.allclose(gradients[0], gradients[2], rtol=0.1)
 
 
 def test_nothing_is_imitated_beyond_the_training_part() -> None:
