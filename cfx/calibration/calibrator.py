@@ -184,9 +184,11 @@ class Calibrator:
         Returns:
             `(P, n)`, SI units.
         """
-        fitted = self
-        if self.solver.chooses_prior:
-            fitted = self._with_prior(self.prior_strength(pairs, batch, last).weight, self.progress)
+        fitted, weight = self, self.solver.strength
+        if weight == "chosen":
+            weight = self.prior_strength(pairs, batch, last).weight
+        if weight is not None:
+            fitted = self._with_prior(weight, self.progress)
         parameters, apart = fitted.searched(pairs, batch, last)
         missed = []
         for pair, end, share in zip(pairs, last.tolist(), apart, strict=True):
@@ -304,7 +306,7 @@ class Calibrator:
 
     def _with_prior(self, weight: float, progress: Callable[[str, int], Task]) -> Calibrator:
         """Returns the same calibrator with another weight of the prior."""
-        solver = replace(self.solver, prior=weight, chooses_prior=False)
+        solver = replace(self.solver, prior=weight, strength=None)
         return Calibrator(
             solver,
             cache=self.cache,

@@ -23,15 +23,14 @@ from cfx.models.base import Leader
 from cfx.simulation.base import Stepper
 from cfx.simulation.trajectory import ComponentKey, Segments, Start, Terms, common_shape
 
-_WEIGHTS = {"weak": 0.01, "chosen": 0.01, "none": 0.0}
-"""Weights of the priors; of the chosen one that of pooled parameters. With the weak one, a
-parameter that is one unit of the squashed space away from its default costs 1 % of the default's
-loss over n; 13 instead of 33 m/s, of 1 to 70, is 1.4 units away."""
+_WEAK = 0.01
+"""The weak prior's weight: a parameter that is one unit of the squashed space away from its default
+costs 1 % of the default's loss over n; 13 instead of 33 m/s, of 1 to 70, is 1.4 units away."""
 
 
-def prior_weight(name: str) -> float:
-    """Returns the weight of a prior that `calibration.prior` names."""
-    return _WEIGHTS[name]
+def prior_weight(prior: str | float) -> float:
+    """Returns the weight of `calibration.prior` on pooled parameters: the weak one, or none."""
+    return 0.0 if prior == "none" else _WEAK
 
 
 @dataclass(frozen=True)

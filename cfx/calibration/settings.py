@@ -5,7 +5,7 @@ Imports no torch: a wrong configuration is answered at once, and results are rea
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -51,12 +51,13 @@ one seed to the next (the 5 % point of a normal distribution: standard error 0.2
 class CalibrationSettings(Settings):
     """Settings of the calibration of driver-specific and pooled parameters."""
 
-    prior: Literal["weak", "chosen", "none"] = Field(
+    prior: Literal["weak", "chosen", "none"] | Annotated[float, Field(gt=0)] = Field(
         "chosen",
         description="weak: parameters that a recording does not determine stay near the model's"
         " default; chosen: driver-specific ones have the strength of the prior that errs least on"
-        " thirds of what is calibrated on that are left out, for all drivers together; none: as in"
-        " the paper",
+        " thirds of what is calibrated on that are left out, for all drivers together; a number:"
+        " they have that strength, such as one that chosen has found on longer recordings; none: as"
+        " in the paper",
     )
     pooled_segment_s: float | None = Field(
         None,

@@ -9,7 +9,7 @@ Shapes: P pairs of a shard, T frames of the longest, W windows, K groups, n tune
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -56,7 +56,8 @@ class Solver:
         prior: weight of the prior on driver-specific and pooled parameters
             (`cfx.calibration.losses`); 0: none. Labels have none: ties go to
             driver-specific parameters.
-        chooses_prior: that of driver-specific ones is chosen (`cfx.calibration.strength`).
+        strength: that of driver-specific parameters, where it is another: a weight, or `chosen`
+            (`cfx.calibration.strength`).
         pooled_segment_s: length of the segments that pooled parameters are calibrated on, s; None:
             whole trajectories.
     """
@@ -67,7 +68,7 @@ class Solver:
     objective: Objective = field(default_factory=SpeedRmse)
     memory: int = 1 << 30
     prior: float = 0.0
-    chooses_prior: bool = False
+    strength: float | Literal["chosen"] | None = None
     pooled_segment_s: float | None = None
 
     @property

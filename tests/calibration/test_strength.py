@@ -8,12 +8,14 @@ from dataclasses import replace
 import pytest
 import torch
 
+import cfx
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.random_search import RandomSearch
 from cfx.calibration.shards import Solver
 from cfx.calibration.strength import FITTED, MOST, WEIGHTS, PriorStrength
 from cfx.data.pairs import PairBatch
+from cfx.errors import ConfigError
 from cfx.models.krauss import Krauss
 from cfx.simulation.rollout import MemoryStepper
 from cfx.simulation.synthetic import SyntheticDataset
@@ -31,7 +33,7 @@ def test_it_is_where_a_parabola_has_the_least_error_for_all_that_may_be_used() -
 @pytest.fixture
 def calibrator() -> Calibrator:
     solver = Solver(
-        MemoryStepper(Krauss(), 0.1), RandomSearch(samples=64), 0, prior=0.01, chooses_prior=True
+        MemoryStepper(Krauss(), 0.1), RandomSearch(samples=64), 0, prior=0.01, strength="chosen"
     )
     return Calibrator(solver, cache=Cache(None))
 
@@ -43,9 +45,27 @@ def test_what_is_chosen_is_what_is_calibrated_with(calibrator: Calibrator) -> No
     found = calibrator.driver_specific(pairs, batch, last)
     (strength,) = calibrator.strengths
     assert set(strength.errors) == set(WEIGHTS)
-    given = replace(calibrator.solver, prior=strength.weight, chooses_prior=False)
+    given = replace(calibrator.solver, prior=strength.weight, strength=None)
     same = Calibrator(given, cache=Cache(None)).driver_specific(pairs, batch, last)
     assert torch.equal(found, same)
+
+
+def test_a_number_is_the_strength_of_driver_specific_parameters_alone() -> None:
+    pairs = cfx.read(dataset="synthetic", pairs=3, frames=200)
+    quick = {"optimizer": "random", "optimizer.samples": 64}
+    by_prior = {}
+    for prior in ("weak", 0.01, 1.0):
+        by_prior[prior] = cfx.calibrate(pairs, **quick, **{"calibration.prior": prior})
+    assert by_prior[0.01].parameters.equals(by_prior["weak"].parameters)
+    assert not by_prior[1.0].parameters.equals(by_prior["weak"].parameters)
+    assert by_prior[1.0].pooled.equals(by_prior["weak"].pooled)
+
+
+@pytest.mark.parametrize("prior", [0.0, -1.0, math.inf, "true", "strong"])
+def test_other_strengths_are_refused(prior: float | str) -> None:
+    pairs = cfx.read(dataset="synthetic", pairs=1, frames=60)
+    with pytest.raises(ConfigError, match=r"calibration\.prior"):
+        cfx.calibrate(pairs, **{"calibration.prior": prior})
 
 
 def test_of_many_pairs_some_from_first_to_last_are_tried(calibrator: Calibrator) -> None:

@@ -345,7 +345,7 @@ def compose(
         objective=components.objective,
         memory=bound,
         prior=prior_weight(config.calibration.prior),
-        chooses_prior=config.calibration.prior == "chosen",
+        strength=None if config.calibration.prior in ("weak", "none") else config.calibration.prior,
         pooled_segment_s=config.calibration.pooled_segment_s,
     )
     reported = {}

@@ -80,13 +80,14 @@ class ParameterPrior:
     precision: Tensor
 
     @classmethod
-    def of(cls, space: ParameterSpace, name: Literal["weak", "chosen", "none"]) -> ParameterPrior:
-        """Returns the prior that `calibration.prior` names.
+    def of(cls, space: ParameterSpace, prior: str | float) -> ParameterPrior:
+        """Returns the prior of `calibration.prior`.
 
-        Weak: around the model's defaults. None: uniform between the bounds.
+        None: uniform between the bounds. Else around the model's defaults; how strongly they draw
+        the point estimates changes nothing here.
         """
         identity = torch.eye(len(space), dtype=torch.float64)
-        if name == "none":
+        if prior == "none":
             # The curvature of a logistic distribution at its middle.
             return cls(None, 0.5 * identity)
         center = squashed(space.to_unit(space.defaults()))
