@@ -56,6 +56,7 @@ class ConstantDriver(Driver):
 
     def __init__(self, settings: Mapping[str, Any], parameters: pd.DataFrame) -> None:
         self._settings = settings
+        self._names = list(parameters.columns)
         self._parameters = torch.tensor(parameters.to_numpy(dtype="float64"))
         node = cfx.config(**settings).config.model
         self._model = cast(DrivingModel, registry.create("model", node))
@@ -75,6 +76,27 @@ class ConstantDriver(Driver):
         parameters = self._parameters.expand(len(first), -1)
         driven = simulate_follower(self._model, parameters, leader, Start(*start), batch.dt)
         return on_frames(driven.speed, batch, first)
+
+    @property
+    def chooses_strength(self) -> bool:
+        """Whether the strength of the prior is left to the benchmark."""
+        return "calibration.prior" not in self._settings
+
+    def drawn_back(self, past: PairSet, seed: int, strength: float) -> Driver:
+        """Calibrates driver-specific parameters on a past, drawn towards those of this driver.
+
+        Args:
+            past: the recorded pairs up to the last measured frame.
+            seed: of the optimizer.
+            strength: weight of the prior around the parameters, which are the same for all.
+        """
+        settings = dict(self._settings)
+        (center,) = self._parameters.tolist()
+        for name, value in zip(self._names, center, strict=True):
+            settings[f"model.parameters.{name}.default"] = value
+        settings["calibration.prior"] = strength
+        fit = cfx.calibrate(past, split=1.0, seed=seed, **settings)
+        return ConstantDriver(self._settings, fit.parameters)
 
     def adapted(self, past: PairSet, seed: int) -> Driver:
         """Calibrates driver-specific parameters on their past."""

@@ -19,6 +19,7 @@ from cfx.errors import CfxError, ConfigError, DataError
 from cfx.plugin import PairBatch, PairSet
 from cfx_report.benchmark import opencf, published, watching
 from cfx_report.benchmark.board import Entered, lines_of_rows, standings, write_standings
+from cfx_report.benchmark.constants import ConstantDriver
 from cfx_report.benchmark.entries import entry_of
 from cfx_report.benchmark.everything import commands
 from cfx_report.benchmark.leaderboard import render
@@ -450,14 +451,38 @@ def test_an_opencf_submission(recordings: Recordings, tmp_path: Path) -> None:
 
 
 def test_constant_parameters_are_watched_before_a_row_of_them_is_made(
-    recordings: Recordings, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    recordings: Recordings,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
+    """They are drawn towards the pooled ones, as strongly as served others; or as one says."""
     monkeypatch.setattr(watching, "_LEAST_S", 2.0)
-    settings = ("model=idm", "optimizer=random", "optimizer.samples=32", "calibration.prior=weak")
-    entry = ConstantEntry("idm", settings, settings)
-    errors = watching.watch(entry, recordings, tmp_path / "new", 0, (0.0, 5.0))
-    by_seconds = errors.pivot_table("rmse_speed", "pair_id", "watched_s")
-    assert (by_seconds[0.0] != by_seconds[5.0]).all()
+    watched = {}
+    for prior in ((), ("calibration.prior=1000",)):
+        settings = ("model=idm", "optimizer=random", "optimizer.samples=32", *prior)
+        entry = ConstantEntry("idm", settings, settings)
+        errors = watching.watch(entry, recordings, tmp_path / f"new{len(prior)}", 0, (0.0, 5.0))
+        watched[prior] = errors.pivot_table("rmse_speed", "pair_id", "watched_s")
+        said = "strength" in capsys.readouterr().out
+        assert said == (not prior)
+        assert (watched[prior][0.0] != watched[prior][5.0]).all()
+    assert (watched[()][5.0] != watched[prior][5.0]).all()
+
+
+def test_the_strength_is_the_one_that_serves_others_best(recordings: Recordings) -> None:
+    class OneServes(ConstantDriver):
+        """With one strength of the prior it follows its leader, with others it does not."""
+
+        def drawn_back(self, past: PairSet, seed: int, strength: float) -> Driver:
+            assert {round(pair.duration, 1) for pair in past} == {2.1}
+            return Keeps(0.5 if strength == watching.STRENGTHS[2] else 0.0)
+
+    parameters = cfx.calibrate_pooled(recordings.pairs, optimizer="random")
+    driver = OneServes({"model": "idm"}, parameters)
+    pairs = list(recordings.pairs)
+    strength = watching.best_strength(SMALL, driver, pairs, 8.0, 2.0, 0)
+    assert strength == watching.STRENGTHS[2]
 
 
 def test_what_enters(monkeypatch: pytest.MonkeyPatch) -> None:
