@@ -293,10 +293,10 @@ class Fit:
             DataError: there is none.
         """
         place = Path(folder)
-        if not (place / _PARAMETERS).is_file():
+        if not all((place / file).is_file() for file in (_PARAMETERS, _RECORDING)):
             raise DataError(
-                f"{place} holds no fit (it has no {_PARAMETERS}); Fit.save writes one, and cfx.load"
-                " reads any other calibration"
+                f"{place} holds no fit (that has {_PARAMETERS} and {_RECORDING}); Fit.save writes"
+                " one, and cfx.load reads any other calibration"
             )
         from cfx.api.experiment import from_config
 
@@ -504,6 +504,11 @@ def calibrate_pooled(
         (2, 5)
     """
     refuse_unused(settings, {**NOTHING_KEPT, **_NOT_TRAINED, **_NOT_POOLED})
+    if groups is not None and not isinstance(groups, Mapping | pd.Series):
+        raise ConfigError(
+            f"groups: a {type(groups).__name__} says no names of groups; give the ids of each by"
+            " its name: groups={'people': [...], 'acc': [...]}"
+        )
     chosen = {"model": model, "objective": objective, "seed": seed, "split": 1.0}
     chosen |= without_data(settings)
     recording = pairs_from(pairs, settings)
@@ -579,7 +584,8 @@ def compare(*jobs: Fit | Result, **named: Fit | Result) -> Comparison:
         level over all comparisons (Holm); `table` is a data frame.
 
     Raises:
-        ConfigError: fewer than two are given.
+        ConfigError: fewer than two are given, one is no fit and no result, or a name of your choice
+            is what another is called.
 
     Examples:
         >>> import cfx
@@ -590,6 +596,12 @@ def compare(*jobs: Fit | Result, **named: Fit | Result) -> Comparison:
     """
     if len(jobs) + len(named) < 2:
         raise ConfigError("compare: give two fits or results, or more")
+    for given in (*jobs, *named.values()):
+        if not isinstance(given, Fit | Result):
+            raise ConfigError(
+                f"compare: a {type(given).__name__} is no fit and no result; cfx.load(...) reads a"
+                " job's folder, and several stand side by side: cfx.compare(first, second)"
+            )
     results: dict[str, Result] = {}
     for job in jobs:
         result = job.result if isinstance(job, Fit) else job
@@ -601,5 +613,7 @@ def compare(*jobs: Fit | Result, **named: Fit | Result) -> Comparison:
             name += "'"
         results[name] = result
     for name, job in named.items():
+        if name in results:
+            raise ConfigError(f"compare: another is called '{name}' too; choose another name")
         results[name] = job.result if isinstance(job, Fit) else job
     return Comparison.of({name: [result] for name, result in results.items()})

@@ -116,12 +116,11 @@ def test_groups_are_pooled_beside_one_another_as_each_alone(pairs: cfx.Pairs) ->
         ({"mine": ["nobody"]}, "group 'mine': there is no pair 'nobody'"),
         ({"mine": []}, "group 'mine' has no pairs"),
         ({}, "groups: there is none"),
+        (["a1", "b2"], "a list says no names of groups"),
     ],
 )
-def test_groups_that_cannot_be_pooled_are_said(
-    pairs: cfx.Pairs, groups: dict[str, list[str]], said: str
-) -> None:
-    with pytest.raises(DataError, match=said):
+def test_groups_that_cannot_be_pooled_are_said(pairs: cfx.Pairs, groups: Any, said: str) -> None:
+    with pytest.raises(CfxError, match=said):
         cfx.calibrate_pooled(pairs, "idm", groups)
 
 
@@ -491,7 +490,7 @@ def test_a_saved_fit_is_read_back_as_a_fit_and_as_a_job(fit: cfx.Fit, tmp_path: 
     own = cfx.load(folder).metrics["rmse_gap/driver_specific"]
     losses = fit.losses[fit.losses["method"] == "driver_specific"]
     assert own == pytest.approx(losses["test_rmse_gap"].mean())
-    with pytest.raises(DataError, match=r"holds no fit \(it has no parameters.parquet\)"):
+    with pytest.raises(DataError, match=r"holds no fit \(that has parameters.parquet"):
         cfx.Fit.load(tmp_path)
 
 
@@ -529,6 +528,22 @@ def test_fits_are_compared_by_their_errors_on_the_test_part(fit: cfx.Fit) -> Non
     assert "Closest to the drivers" in repr(compared)
     with pytest.raises(ConfigError, match="two fits or results"):
         cfx.compare(fit)
+
+
+@pytest.mark.parametrize(
+    ("given", "named", "said"),
+    [
+        (1, {"idm": 1}, "another is called 'idm' too"),
+        (1, {"other": "outputs/idm"}, "a str is no fit and no result; cfx.load"),
+        (1, {}, "give two fits"),
+    ],
+)
+def test_what_cannot_be_compared_is_said(
+    fit: cfx.Fit, given: int, named: dict[str, Any], said: str
+) -> None:
+    others = {name: fit if value == 1 else value for name, value in named.items()}
+    with pytest.raises(ConfigError, match=said):
+        cfx.compare(*[fit] * given, **others)
 
 
 def test_a_table_of_parameters_may_have_its_ids_in_a_column(fit: cfx.Fit) -> None:

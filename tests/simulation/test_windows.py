@@ -40,6 +40,11 @@ def test_training_windows_stay_before_the_test_part(
     assert bool((split.frame < torch.tensor(frames) - 1).all())
 
 
+def test_drivers_who_are_not_tested_are_learned_from_up_to_their_last_frame() -> None:
+    split = Split.none(straight_pairs([60, 90]), WindowSettings())
+    assert split.frame.tolist() == [59, 89]
+
+
 def test_windows_come_back_from_their_grid() -> None:
     windows = Windows.of(torch.tensor([2, 3]), WindowSettings())
     grid, mask = windows.to_grid(torch.arange(5.0), 2)

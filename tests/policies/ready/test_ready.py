@@ -13,7 +13,7 @@ from cfx.app import cli
 from cfx.app.job.steps import JobComponents, complete, make_protocol
 from cfx.errors import DataError
 from cfx.policies import checkpoint, ready
-from cfx.policies.ready.traffic_table import traffic_lines, traffic_of
+from cfx.policies.ready.traffic_table import outside_words, traffic_lines, traffic_of
 from tests.histories import observed
 
 NAMES = ready.names()
@@ -194,3 +194,12 @@ def test_a_policy_that_is_too_large_or_no_object_is_not_read(
     (tmp_path / "policy.safetensors").write_bytes(b"\xff" * 100)
     with pytest.raises(DataError, match="holds no policy that can be read"):
         checkpoint.load_agent(tmp_path)
+
+
+def test_values_outside_of_what_is_usual_are_counted_among_those_with_usual_values() -> None:
+    rows = [
+        {"usual": "1 to 2", "outside": True},
+        {"usual": "1 to 2", "outside": False},
+        {"usual": "", "outside": False},
+    ]
+    assert outside_words({"rows": rows}) == (1, 2)
