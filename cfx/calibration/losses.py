@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
@@ -31,6 +31,18 @@ costs 1 % of the default's loss over n; 13 instead of 33 m/s, of 1 to 70, is 1.4
 def prior_weight(prior: str | float) -> float:
     """Returns the weight of `calibration.prior` on pooled parameters: the weak one, or none."""
     return 0.0 if prior == "none" else _WEAK
+
+
+def prior_strength(
+    prior: Literal["weak", "chosen", "none"] | float,
+) -> float | Literal["chosen"] | None:
+    """Returns the weight of `calibration.prior` on driver-specific parameters, or `chosen`.
+
+    None: it is that of pooled ones.
+    """
+    if isinstance(prior, str):
+        return "chosen" if prior == "chosen" else None
+    return prior
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,7 @@ from cfx.app.job.surroundings import require_signals, with_signals_of_inputs
 from cfx.calibration.cache import Cache
 from cfx.calibration.calibrator import Calibrator
 from cfx.calibration.identifiability import slices, training_errors
-from cfx.calibration.losses import prior_weight
+from cfx.calibration.losses import prior_strength, prior_weight
 from cfx.calibration.objectives import Objective
 from cfx.calibration.optimizers import Optimizer
 from cfx.calibration.posterior import posterior_method
@@ -345,7 +345,7 @@ def compose(
         objective=components.objective,
         memory=bound,
         prior=prior_weight(config.calibration.prior),
-        strength=None if config.calibration.prior in ("weak", "none") else config.calibration.prior,
+        strength=prior_strength(config.calibration.prior),
         pooled_segment_s=config.calibration.pooled_segment_s,
     )
     reported = {}
