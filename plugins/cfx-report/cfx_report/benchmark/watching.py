@@ -36,7 +36,8 @@ _LEAST_S = 10.0
 """s that are tested at least."""
 
 STRENGTHS = (0.1, 0.3, 1.0, 3.0, 10.0)
-"""Weights of the prior that are tried on drivers who were learned from."""
+"""Weights of the prior that are tried on drivers who were learned from. With 10 parameters hardly
+leave the pooled ones; with 0.1 a few seconds decide them."""
 
 _TRIED_OF_SITE, _TRIED_S = 8, 60.0
 """So many of these drivers of each site are tried at most, for so many s after the longest past."""
