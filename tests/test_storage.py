@@ -10,12 +10,13 @@ import pytest
 
 import cfx
 from cfx.app import cli
+from cfx.app.commands.calibrate import overrides_of
 from cfx.app.sweep.folder import fingerprint
 from cfx.calibration.cache import Cache
 from cfx.core import registry, storage
 from cfx.core.distributions import install_line
 from cfx.core.storage import RemoteFolder, is_url, local_copies, state
-from cfx.data.tidy import TidyDataset, write_tidy
+from cfx.data.tidy import TidyDataset, frame_of, write_tidy
 from cfx.errors import CfxError, DataError, OutputError
 from cfx.results.config import JobConfig
 from cfx.results.folder import Upload, place_of
@@ -64,6 +65,19 @@ def test_a_recording_behind_a_url_is_read_and_copied_once(bucket: str, tmp_path:
     before = copy.stat().st_mtime_ns
     assert local_copies(f"{bucket}/pairs.parquet")[0].stat().st_mtime_ns == before
     assert local_copies(f"{bucket}/*.parquet") == [copy]
+
+
+def test_the_layout_of_a_recording_behind_a_url_is_found_from_the_file(
+    bucket: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """By each of the three ways to name a file without its layout."""
+    url = f"{bucket}/pairs.csv"
+    frame_of(straight_pairs([400, 410])).to_csv(tmp_path / "pairs.csv", index=False)
+    put(url, tmp_path / "pairs.csv")
+    assert cfx.read(url).selected.ids == cfx.read(tmp_path / "pairs.csv").selected.ids
+    assert cli.main(["data", "describe", url]) == 0
+    assert f"Use it: data=tidy data.path={url}" in capsys.readouterr().out
+    assert {"data=tidy", f"data.path={url}"} <= set(overrides_of([url]))
 
 
 def test_a_changed_recording_is_another_one(bucket: str, tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from cfx.app.overrides import config_of
 from cfx.core import registry
 from cfx.core.component import validate
 from cfx.core.files import IN_MEMORY, absolute
-from cfx.core.storage import is_url
+from cfx.core.storage import path_or_url
 from cfx.data.base import Dataset
 from cfx.data.describe import dataset_of
 from cfx.data.frames import Frame, frame_of_source
@@ -233,16 +233,14 @@ def read(source: Any = None, *, dataset: str | None = None, **settings: Any) -> 
         del values["name"]
         reader_settings = validate(TidySettings, values, where="data")
         return Pairs(FrameDataset(reader_settings, frame).load(), node)
-    paths = []
-    for path in [source] if isinstance(source, str | Path) else _paths(source):
-        if is_url(str(path)):
-            paths.append(str(path))
-        else:
-            paths.append(str(absolute(path)))
+    written = [source] if isinstance(source, str | Path) else _paths(source)
+    paths = [path_or_url(path) for path in written]
     own_columns = {"columns", "units"} & settings.keys()
-    name = dataset or ("tidy" if own_columns else dataset_of(Path(paths[0])))
-    overrides["data.path"] = paths[0] if len(paths) == 1 else paths
-    return Pairs.of(config_of({"data": name, **overrides}).data)
+    layout = dataset or ("tidy" if own_columns else dataset_of(paths[0]))
+    # A later change of the working directory then changes nothing.
+    names = [path if isinstance(path, str) else str(path.absolute()) for path in paths]
+    overrides["data.path"] = names[0] if len(names) == 1 else names
+    return Pairs.of(config_of({"data": layout, **overrides}).data)
 
 
 def _all_of(source: Any) -> Any:
@@ -261,8 +259,8 @@ def _paths(source: Any) -> list[str | Path]:
     paths = list(source) if isinstance(source, list | tuple | set) else []
     if not paths or not all(isinstance(path, str | Path) for path in paths):
         raise ConfigError(
-            f"a {type(source).__name__} of this kind is no recording; give a path, a list of paths,"
-            " a data frame, or what cfx.read returned"
+            f"what is given ({type(source).__name__}) is no recording; give a path, a list of"
+            " paths, a data frame, or what cfx.read returned"
         )
     return paths
 

@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from cfx.simulation.trajectory import Trajectory
 
 _STANDSTILL_M, _TIME_GAP_S = 2.0, 1.5
-"""Where a follower begins behind a given leader: so far, and so many seconds of their speed."""
+"""The first gap behind a given leader, unless it is given: the first, plus the follower's first
+speed times the second."""
 
 _FASTEST_MPS, _LONGEST_STEP_S = 100.0, 2.0
 """Beyond these a leader's speeds or times are in another unit."""
@@ -63,14 +64,15 @@ def simulate(
 
     Args:
         model: as after `model=`.
-        parameters: a `Fit` (each driver's own), a mapping or a series of values by name for all
-            followers, or a frame with a row for each, whose index or column `pair_id` has the
-            pairs' ids; SI units. What is left out is at its default; None: all is.
+        parameters: a mapping or a series of values by name for all followers, or a row for each:
+            a `Fit` or a frame whose index or column `pair_id` has the pairs' ids (behind `leader`:
+            the followers' names); SI units. What is left out is at its default; None: all is.
         pairs: recorded leaders and the followers' starts, as `cfx.read` takes them.
         leader: in place of `pairs`: a leader's speed over time, as columns `time_s` and `speed`
             (m/s), or as a series of it whose index is the time. The step must be constant.
         at: s after a pair's first frame, from whose measured state the follower is simulated.
-        gap: behind a given leader: the first bumper-to-bumper gap, m; None: 2 m and 1.5 s.
+        gap: behind a given leader: the first bumper-to-bumper gap, m; None: 2 m plus 1.5 s times
+            the follower's first speed.
         speed: behind a given leader: the follower's first speed, m/s; None: the leader's.
         settings: of the model, as on the command line: `**{"model.limits": None}`; of reading a
             file, `**{"data.max_pairs": 20}`.
@@ -81,7 +83,8 @@ def simulate(
         where it starts from.
 
     Raises:
-        CfxError: a parameter is unknown or outside its bounds, or the leader is no time series.
+        CfxError: a parameter is unknown or no finite number, a row is missing, the leader is no
+            time series, a start is negative, or a setting or argument does not belong to the rest.
 
     Examples:
         >>> import cfx
@@ -111,40 +114,64 @@ def simulate(
                     f"{key}={value} does nothing here: a simulation reads the model's settings and"
                     " those of data alone; leave it out"
                 )
-        made = cast(
+        driving_model = cast(
             DrivingModel, registry.create("model", config_of({"model": model, **of_model}).model)
         )
-        if made.needs_simulator:
+        if driving_model.needs_simulator:
             raise ConfigError(
-                f"model={model} has equations in {made.needs_simulator} alone and cannot be"
-                " simulated here; run a job with it"
+                f"model={model} has equations in {driving_model.needs_simulator} alone and cannot"
+                " be simulated here; run a job with it"
             )
-        recording = _recording(parameters, pairs, leader, (gap, speed), settings)
+        if pairs is None and leader is None and isinstance(parameters, Fit):
+            pairs = parameters.recorded
+        rows = _rows_of(parameters)
+        recording = _recording(rows, pairs, leader, (gap, speed), settings)
         batch = PairBatch.of(recording)
-        first = round(at / batch.dt)
-        if not 0 <= first < int(batch.lengths.min()) - 1:
+        start_frame = round(at / batch.dt)
+        if not 0 <= start_frame < int(batch.lengths.min()) - 1:
             raise ConfigError(
                 f"at={at:g}: the shortest pair has {int(batch.lengths.min())} frames of"
                 f" {batch.dt:g} s; give a time within it"
             )
-        values = _values(parameters, recording.ids, made)
-        ahead = Leader(
-            batch.leader_position[:, first:],
-            batch.leader_speed[:, first:],
-            batch.leader_acceleration[:, first:],
+        values = _values(rows, recording.ids, driving_model)
+        leaders = Leader(
+            batch.leader_position[:, start_frame:],
+            batch.leader_speed[:, start_frame:],
+            batch.leader_acceleration[:, start_frame:],
             batch.leader_length,
         )
         start = Start(
-            batch.follower_position[:, first],
-            batch.follower_speed[:, first],
-            batch.follower_acceleration[:, first],
+            batch.follower_position[:, start_frame],
+            batch.follower_speed[:, start_frame],
+            batch.follower_acceleration[:, start_frame],
         )
-        trajectory = rollout(made, values, ahead, start, batch.dt)
-        return _table(recording, trajectory, start.acceleration, first)
+        trajectory = rollout(driving_model, values, leaders, start, batch.dt)
+        return _table(recording, trajectory, start.acceleration, start_frame)
+
+
+def _rows_of(parameters: Parameters) -> pd.DataFrame | dict[str, float]:
+    """Returns a row of values for each follower, by its name, or one set for all.
+
+    Raises:
+        ConfigError: there are no rows, or two of one name.
+    """
+    if isinstance(parameters, Fit):
+        parameters = parameters.parameters
+    if not isinstance(parameters, pd.DataFrame):
+        return {} if parameters is None else dict(parameters)
+    if "pair_id" in parameters:
+        parameters = parameters.set_index("pair_id")
+    if not len(parameters):
+        raise ConfigError("parameters: there are no rows; give a row for each follower, or one set")
+    names = names_of(parameters.index)
+    twice = named_twice(names)
+    if twice is not None:
+        raise ConfigError(f"parameters: two rows are of pair '{twice}'; give one row for each pair")
+    return parameters.set_axis(names)
 
 
 def _recording(
-    parameters: Parameters,
+    rows: pd.DataFrame | dict[str, float],
     pairs: PairsLike | None,
     leader: pd.DataFrame | pd.Series | None,
     start: tuple[float | None, float | None],
@@ -153,7 +180,8 @@ def _recording(
     """Returns the leaders, and where their followers start.
 
     Args:
-        parameters, pairs, leader: as of `simulate`.
+        rows: values of each follower, or one set for all.
+        pairs, leader: as of `simulate`.
         start: gap (m) and speed (m/s) of a follower of `leader`.
         settings: of the call; those of `data` say how a file is read.
 
@@ -168,14 +196,10 @@ def _recording(
     if leader is not None:
         if pairs is not None:
             raise ConfigError("give pairs or leader, not both")
-        names = ["follower"]
-        if isinstance(parameters, pd.DataFrame):
-            names = names_of(parameters.index)
+        names = list(rows.index) if isinstance(rows, pd.DataFrame) else ["follower"]
         return _behind(leader, names, gap, speed)
     if gap is not None or speed is not None:
         raise ConfigError("gap and speed say where a follower of leader=... starts; give a leader")
-    if pairs is None and isinstance(parameters, Fit):
-        return parameters.recorded.selected
     if pairs is None:
         raise ConfigError("give recorded pairs, or leader=FRAME with columns time_s and speed")
     return pairs_from(pairs, settings).selected
@@ -198,9 +222,11 @@ def _behind(
     if speeds.max() > _FASTEST_MPS:
         raise DataError(f"leader: speed goes up to {speeds.max():g}; give m/s")
     dt = round(dt, 9)
-    start = float(speeds[0]) if speed is None else _at_least_0("speed", speed, "m/s")
-    ahead = _STANDSTILL_M + _TIME_GAP_S * start if gap is None else _at_least_0("gap", gap, "m")
-    still = np.zeros(len(time))
+    start = float(speeds[0]) if speed is None else _not_negative("speed", speed, "m/s")
+    default_gap = _STANDSTILL_M + _TIME_GAP_S * start
+    first_gap = default_gap if gap is None else _not_negative("gap", gap, "m")
+    # Only the first frame of the follower is read: its other values are never compared with.
+    zeros = np.zeros(len(time))
     pairs = []
     for name in names:
         pairs.append(
@@ -212,50 +238,54 @@ def _behind(
                 first_frame=0,
                 dt=dt,
                 leader_length=0.0,
-                leader_position=ahead + distance_driven(speeds, dt),
+                leader_position=first_gap + distance_driven(speeds, dt),
                 leader_speed=speeds,
                 leader_acceleration=accelerations(speeds, dt),
-                follower_position=still,
-                follower_speed=still + start,
-                follower_acceleration=still,
+                follower_position=zeros,
+                follower_speed=zeros + start,
+                follower_acceleration=zeros,
             )
         )
     return PairSet(tuple(pairs), "the given leader")
 
 
-def _at_least_0(name: str, value: Any, unit: str) -> float:
-    """Returns a value of a follower's start."""
+def _not_negative(name: str, value: Any, unit: str) -> float:
+    """Returns a value of a follower's start.
+
+    Raises:
+        ConfigError: it is negative, infinite or no number.
+    """
     number = float(value) if isinstance(value, Real) else math.nan
     if not (math.isfinite(number) and number >= 0):
         raise ConfigError(f"{name}={value!r}: give a number of 0 {unit} or more")
     return number
 
 
-def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict[str, Tensor]:
-    """Returns values `(P,)` by name."""
+def _values(
+    rows: pd.DataFrame | dict[str, float], ids: list[str], model: DrivingModel
+) -> dict[str, Tensor]:
+    """Returns the values of each pair, `(P,)` by name.
+
+    Args:
+        rows: values of each follower, or one set for all.
+        ids: of the P pairs.
+        model: whose parameters they are.
+
+    Raises:
+        CfxError: a pair has no row, or a parameter is unknown or no finite number.
+    """
     import torch
 
-    if isinstance(parameters, Fit):
-        parameters = parameters.parameters
-    if isinstance(parameters, pd.DataFrame):
-        if "pair_id" in parameters:
-            parameters = parameters.set_index("pair_id")
-        names = names_of(parameters.index)
-        twice = named_twice(names)
-        if twice is not None:
-            raise ConfigError(
-                f"parameters: two rows are of pair '{twice}'; give one row for each pair"
-            )
-        table = parameters.set_axis(names)
-        missing = pd.Index(ids)[~pd.Index(ids).isin(table.index)]
+    if isinstance(rows, pd.DataFrame):
+        missing = pd.Index(ids)[~pd.Index(ids).isin(rows.index)]
         if len(missing):
             raise ConfigError(
                 f"parameters: there is no row for pair '{missing[0]}' ({len(missing)} such pairs);"
                 " give a row for each, or one set for all"
             )
-        table = table.loc[ids]
+        table = rows.loc[ids]
     else:
-        table = pd.DataFrame([{} if parameters is None else dict(parameters)] * len(ids), ids)
+        table = pd.DataFrame([rows] * len(ids), ids)
     values = {}
     for name in table.columns.astype(str):
         model.space[name]  # says that it is unknown
@@ -266,19 +296,28 @@ def _values(parameters: Parameters, ids: list[str], model: DrivingModel) -> dict
     return values
 
 
-def _table(pairs: PairSet, trajectory: Trajectory, at_start: Tensor, first: int) -> pd.DataFrame:
-    """Returns a row per follower and frame; `at_start` are the followers' first accelerations."""
+def _table(
+    pairs: PairSet, trajectory: Trajectory, first_acceleration: Tensor, start_frame: int
+) -> pd.DataFrame:
+    """Returns a row per follower and frame, from the frame that they start at.
+
+    Args:
+        pairs: P pairs.
+        trajectory: of their followers, simulated.
+        first_acceleration: of each follower as it starts, m/s2, `(P,)`.
+        start_frame: number of the frame, of each pair, that the trajectory begins with.
+    """
     parts = []
     for number, pair in enumerate(pairs):
-        count = len(pair) - first
+        count = len(pair) - start_frame
         speed = trajectory.speed[number, :count].numpy()
         columns = {
             "pair_id": pair.pair_id,
-            "time_s": (first + np.arange(count)) * pair.dt,
-            "leader_speed": np.asarray(pair.leader_speed)[first:],
+            "time_s": (start_frame + np.arange(count)) * pair.dt,
+            "leader_speed": np.asarray(pair.leader_speed)[start_frame:],
             "position": trajectory.position[number, :count].numpy(),
             "speed": speed,
-            "acceleration": np.append(float(at_start[number]), np.diff(speed) / pair.dt),
+            "acceleration": np.append(float(first_acceleration[number]), np.diff(speed) / pair.dt),
             "gap": trajectory.gap[number, :count].numpy(),
         }
         parts.append(pd.DataFrame(columns))

@@ -105,6 +105,9 @@ class Objective(Component):
             frames: many frames.
             counted: 1 (or True) for frames that count and 0 for others, broadcasting to the frames.
             dim: the dimension of time, of the frames and of `counted` alike.
+
+        Returns:
+            As many tensors as there are terms, without the dimension of time: `(*batch,)` each.
         """
         total = [(term * counted).sum(dim) for term in self.terms(frames)]
         return tuple(total)
@@ -141,5 +144,9 @@ def root_mean_square(total: Tensor, count: Tensor, epsilon: float = 0.0) -> Tens
 
 
 def ratio(numerator: Tensor, denominator: Tensor) -> Tensor:
-    """Returns the ratio of tensors that are not negative, and 0 where both are 0."""
+    """Returns the ratio of two tensors that are not negative; the numerator where it divides by 0.
+
+    So an objective whose denominator is 0, of a measured follower that stands still all the time,
+    is 0 for a simulated one that stands still too and finite for all others.
+    """
     return numerator / denominator.masked_fill(denominator == 0, 1.0)

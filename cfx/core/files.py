@@ -147,12 +147,12 @@ def write_json(path: Path, values: Mapping[str, Any]) -> None:
         temporary.write_text(json.dumps(values, indent=2) + "\n", encoding="utf-8")
 
 
-_PLAIN = re.compile(r"[\w./+-]+", re.ASCII)
+_PLAIN = re.compile(r"[\w./+:-]+", re.ASCII)
 """Values that Hydra's grammar takes as they are."""
 
 
-def path_override(key: str, path: Path) -> str:
-    """Returns the override that gives a setting a path, quoted where its signs ask for it."""
+def path_override(key: str, path: Path | str) -> str:
+    """Returns the override that gives a setting a path or URL, in quotes where it needs them."""
     return f"{key}={quoted(str(path))}"
 
 

@@ -18,7 +18,14 @@ from typing import Any
 
 from cfx.core.distributions import install_line
 from cfx.core.files import atomic_write
-from cfx.errors import CfxError, DataError, NotInstalledError, first_line, without_passwords
+from cfx.errors import (
+    CfxError,
+    ConfigError,
+    DataError,
+    NotInstalledError,
+    first_line,
+    without_passwords,
+)
 
 __all__ = [
     "is_url",
@@ -27,7 +34,15 @@ __all__ = [
 """What plugins may use, as `cfx.plugin.storage`."""
 
 
-_PACKAGES = {"s3": "s3fs", "s3a": "s3fs", "gs": "gcsfs", "gcs": "gcsfs", "abfs": "adlfs"}
+_PACKAGES = {
+    "s3": "s3fs",
+    "s3a": "s3fs",
+    "gs": "gcsfs",
+    "gcs": "gcsfs",
+    "abfs": "adlfs",
+    "http": "aiohttp",
+    "https": "aiohttp",
+}
 """Packages that fsspec needs for kinds of URLs."""
 
 _VERSIONS = ("ETag", "etag", "md5Hash", "content_md5", "mtime", "LastModified", "updated")
@@ -39,6 +54,17 @@ _CHARACTERS_OF_A_SCHEME = r"[a-zA-Z][a-zA-Z0-9+.-]+://"
 def is_url(value: object) -> bool:
     """Says whether a value is a URL and no path of this machine."""
     return isinstance(value, str) and re.match(_CHARACTERS_OF_A_SCHEME, value) is not None
+
+
+def path_or_url(written: str | Path) -> Path | str:
+    """Returns a URL as it is, and everything else as a path; `~` is the user's home.
+
+    Raises:
+        ConfigError: nothing is written.
+    """
+    if not str(written).strip():
+        raise ConfigError("the name of the file is empty; give its path or URL")
+    return str(written) if is_url(str(written)) else Path(written).expanduser()
 
 
 def local_copies(url: str) -> list[Path]:

@@ -19,6 +19,7 @@ from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.core.files import path_override
 from cfx.core.registry import Entry
+from cfx.core.storage import local_copies
 from cfx.data.base import Contents, Dataset, rounded_down
 from cfx.data.check import Check, judge
 from cfx.data.files import Floats, Ints, beginning, has_letters, partitions
@@ -90,7 +91,7 @@ class Description(NamedTuple):
 
 
 def describe(
-    path: Path, settings: Mapping[str, Any] | None = None, options: str = ""
+    source: Path | str, settings: Mapping[str, Any] | None = None, options: str = ""
 ) -> Description:
     """Reads a recording and says what it holds.
 
@@ -99,6 +100,7 @@ def describe(
     whether it is its own, those of plugins too.
 
     Args:
+        source: a file or folder, or a file's URL.
         settings: of the dataset that reads it, and its `name`.
         options: what stands on the command line for these settings, after a blank.
 
@@ -106,16 +108,15 @@ def describe(
         DataError: the file cannot be used; the message says why.
         ConfigError: a setting is wrong.
     """
-    path = path.expanduser()
     if settings is None:
-        settings = {"name": dataset_of(path)}
+        settings = {"name": dataset_of(source)}
     reader = _Reader(settings, options)
-    if reader.name == "tidy" and path.is_dir():
-        return Description(_describe_partitions(path, reader), None)
-    dataset = reader.of(path)
+    if isinstance(source, Path) and reader.name == "tidy" and source.is_dir():
+        return Description(_describe_partitions(source, reader), None)
+    dataset = reader.of(source)
     contents = dataset.contents()
     pieces: list[RenderableType] = [
-        str(path),
+        str(source),
         "",
         _overview(dataset.layout, contents, dataset.units()),
     ]
@@ -139,7 +140,7 @@ def describe(
     for sentence in problems:
         pieces.append(f"  {sentence}")
     more, sentences = _advice(_lengths(contents.pairs), dataset.settings.min_duration)
-    pieces += ["", reader.use(path) + more, *sentences]
+    pieces += ["", reader.use(source) + more, *sentences]
     return Description(_text(pieces), contents.pairs)
 
 
@@ -264,13 +265,13 @@ class _Reader(NamedTuple):
     def name(self) -> str:
         return str(self.settings["name"])
 
-    def of(self, path: Path) -> Dataset:
+    def of(self, source: Path | str) -> Dataset:
         """Returns the dataset of a file."""
-        return cast(Dataset, registry.create("dataset", {**self.settings, "path": str(path)}))
+        return cast(Dataset, registry.create("dataset", {**self.settings, "path": str(source)}))
 
-    def use(self, path: Path) -> str:
+    def use(self, source: Path | str) -> str:
         """Returns the line that names the file in a job."""
-        override = shlex.quote(path_override("data.path", path))
+        override = shlex.quote(path_override("data.path", source))
         return f"Use it: data={self.name} {override}{self.options}"
 
 
@@ -322,12 +323,17 @@ def _text(pieces: Sequence[RenderableType], width: int = _WIDTH) -> str:
     return "\n".join(map(str.rstrip, text.getvalue().splitlines()))
 
 
-def dataset_of(path: Path) -> str:
+def dataset_of(source: Path | str) -> str:
     """Returns the name of the dataset that reads a file; cfx's own are asked before plugins'.
 
+    Args:
+        source: a file or folder; or the URL of a file, or of several as a pattern, of which the
+            first is looked at.
+
     Raises:
-        DataError: it has columns that none of them knows.
+        DataError: it cannot be read, or has columns that none of them knows.
     """
+    path = local_copies(source)[0] if isinstance(source, str) else source
     start = beginning(path)
     layouts = []
     # Sorting is stable: cfx's own come first, each group by name.
@@ -342,20 +348,20 @@ def dataset_of(path: Path) -> str:
             layouts.append(f"{cls.layout} (data={entry.name})")
     if start.magic and not start.lines and not start.columns:
         raise DataError(
-            f"{path}: is a binary file that no dataset knows. Known layouts: {'; '.join(layouts)}."
-            " Write a table as CSV or parquet (docs/how-to/own-recording.md)"
+            f"{source}: is a binary file that no dataset knows. Known layouts:"
+            f" {'; '.join(layouts)}. Write a table as CSV or parquet (docs/how-to/own-recording.md)"
         )
     if start.lines and start.lines[0].lstrip().startswith("<"):
         raise DataError(
-            f"{path}: is XML, of which SUMO's FCD output alone is read (<fcd-export>); write a"
+            f"{source}: is XML, of which SUMO's FCD output alone is read (<fcd-export>); write a"
             " table as CSV or parquet (docs/how-to/own-recording.md)"
         )
     has_names = has_letters("".join(start.columns))
     if start.path.is_dir() or has_names:
         columns = listed(start.columns, 20) or "none: it is a folder"
         raise DataError(
-            f"{path}: no dataset knows this layout. Columns found: {columns}. Known layouts:"
-            f" {'; '.join(layouts)}. {_own_columns(path, start.columns)}"
+            f"{source}: no dataset knows this layout. Columns found: {columns}. Known layouts:"
+            f" {'; '.join(layouts)}. {_own_columns(source, start.columns)}"
         )
     return "ngsim"  # whose reader says what is wrong with a file without column names
 
@@ -382,7 +388,7 @@ _WRITTEN_UNITS = {
 """Units that names of columns end in."""
 
 
-def _own_columns(path: Path, columns: Sequence[str]) -> str:
+def _own_columns(source: Path | str, columns: Sequence[str]) -> str:
     """Returns what to write for a table whose columns have names of their own."""
     column_of: dict[str, str] = {}
     units = []
@@ -401,7 +407,7 @@ def _own_columns(path: Path, columns: Sequence[str]) -> str:
         words.append(f"data.units.{quantity}={unit}")
     return (
         "If it is a table of pairs, a row for each pair and frame, say what its columns are, and"
-        f" their units: cfx data describe {shlex.quote(str(path))} {' '.join(words)}"
+        f" their units: cfx data describe {shlex.quote(str(source))} {' '.join(words)}"
         " (docs/how-to/own-recording.md); else see docs/readers.md"
     )
 

@@ -42,10 +42,10 @@ VEHICLE_M = 4.8
 
 RELATIVE_SPEED_MPS = 0.5
 ACCELERATION_MPS2 = 0.4
-"""Below both of them a driver follows steadily."""
+"""A driver follows steadily in a frame in which both are smaller, whatever their sign."""
 
 LEAST_S = 3.0
-"""s: how long a pair has to follow steadily in a range of speed to count in it."""
+"""s: a pair counts in a range of speed if it follows steadily there for this long, in all."""
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class SteadyFollowing(NamedTuple):
         speed: mean speed, m/s.
         gap: mean gap, bumper to bumper, m. Speed and gap are NaN where a pair followed steadily for
             less than `LEAST_S`.
-        seconds: how long each pair followed steadily.
+        seconds: for how long each pair followed steadily in each range.
     """
 
     speed: Tensor
@@ -89,14 +89,14 @@ class GapRelation(NamedTuple):
         return {name: np.round(getattr(self, name), 3).tolist() for name in self._fields}
 
     def gap_at(self, speed: Floats) -> Floats:
-        """Returns the gap of the mean spacing at speeds, m; NaN outside of the recorded ones."""
+        """Returns the gap at the mean time headway, m; NaN outside of the recorded speeds."""
         if not len(self.speed):
             return np.full_like(speed, np.nan)
         return np.interp(speed, self.speed, self.gap, left=np.nan, right=np.nan)
 
 
 def flow(speed: Floats, gap: Floats) -> Floats:
-    """Returns the flow, vehicles/h, of a lane in which all drive at this speed, m/s, and gap, m."""
+    """Returns the flow of a lane, vehicles/h, in which all keep one speed, m/s, and one gap, m."""
     return 3600.0 * speed / (gap + VEHICLE_M)
 
 
@@ -115,14 +115,14 @@ def steady_following(batch: PairBatch, counted: Tensor | None = None) -> SteadyF
     if counted is not None:
         is_steady &= counted
     edges = torch.tensor(EDGES_MPS, dtype=speed.dtype, device=speed.device)
-    place = torch.bucketize(speed, edges, right=True) - 1
-    is_steady &= (place >= 0) & (place < len(edges) - 1)
-    place = place.clamp(0, len(edges) - 2)
+    speed_range = torch.bucketize(speed, edges, right=True) - 1
+    is_steady &= (speed_range >= 0) & (speed_range < len(edges) - 1)
+    speed_range = speed_range.clamp(0, len(edges) - 2)  # what is outside has the weight 0
     weight = is_steady.to(torch.float64)
     sums = []
     for values in (weight, weight * speed.double(), weight * gap.double()):
         total = weight.new_zeros((len(batch), len(edges) - 1))
-        sums.append(total.scatter_add_(1, place, values))
+        sums.append(total.scatter_add_(1, speed_range, values))
     frames = sums[0]
     is_long = frames * batch.dt >= LEAST_S
     means = []

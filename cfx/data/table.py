@@ -170,7 +170,7 @@ class Layout:
             name = names[match.at]
             if names.count(name) > 1:
                 raise DataError(
-                    f"{source}: column {name} stands in the file more than once; remove one of them"
+                    f"{source}: column {name} stands there more than once; remove one of them"
                 )
         if missing:
             raise DataError(self._missing(source, missing, names) + advice)
@@ -227,7 +227,7 @@ class Layout:
             if hint:
                 hints[f" {hint}"] = None
         text += "".join(hints)
-        return f"{text} Columns found: {listed(names, 30)}."
+        return f"{text} Columns found: {listed(names, 30) or 'none'}."
 
 
 class _Found(NamedTuple):

@@ -24,6 +24,7 @@ WEAK = {"calibration.prior": "weak"}
 RANDOM = {"optimizer": "random", "optimizer.samples": 256, **WEAK}
 OFF = ["tracking.enabled=false", "figures=none", "cache.enabled=false"]
 LEADER = pd.DataFrame({"time_s": np.arange(600) * 0.1, "speed": 15.0})
+NOBODY = pd.DataFrame({"T": []})
 
 
 class Job(NamedTuple):
@@ -334,12 +335,22 @@ def test_one_leader_is_followed_by_each_row_of_parameters() -> None:
     assert as_series["gap"].iloc[0] == pytest.approx(2.0 + 1.5 * 15.0)
 
 
+def test_one_leader_is_followed_by_every_driver_of_a_fit(fit: cfx.Fit) -> None:
+    """Whether they are given as the fit, as its table, or as a table with a column of ids."""
+    of_fit = cfx.simulate("idm", fit, leader=LEADER)
+    assert list(of_fit["pair_id"].unique()) == list(fit.parameters.index)
+    assert of_fit.groupby("pair_id")["gap"].last().nunique() == len(fit.parameters)
+    for table in (fit.parameters, fit.parameters.reset_index()):
+        pd.testing.assert_frame_equal(cfx.simulate("idm", table, leader=LEADER), of_fit)
+
+
 REFUSED: list[tuple[type[CfxError], str, dict[str, Any]]] = [
     (ParameterError, "T=9 is outside its bounds", {"parameters": {"T": 9.0}, "leader": LEADER}),
     (ParameterError, "unknown parameter", {"parameters": {"tau": 1.0}, "leader": LEADER}),
     (DataError, "column speed is missing", {"leader": LEADER.rename(columns={"speed": "v"})}),
     (DataError, "constant step", {"leader": LEADER.iloc[[0, 1, 5]]}),
     (DataError, "0 or more", {"leader": LEADER.assign(speed=-1.0)}),
+    (ConfigError, "parameters: there are no rows", {"parameters": NOBODY, "leader": LEADER}),
     (ConfigError, "give recorded pairs", {}),
     (ConfigError, "give a leader", {"gap": 3.0}),
     (ConfigError, "at=1000", {"leader": LEADER, "at": 1000.0}),
@@ -455,12 +466,12 @@ def test_a_follower_starts_from_numbers_that_mean_something(
         cfx.simulate("idm", **{"leader": LEADER, **given})
 
 
-@pytest.mark.parametrize("given", [None, 3, [1, 2], []])
+@pytest.mark.parametrize("given", [None, 3, [1, 2], [], ""])
 def test_what_is_no_recording_is_said(given: Any) -> None:
     """Nothing falls back to a recording that nobody asked for."""
-    with pytest.raises(ConfigError, match=r"give a (path|file)"):
+    with pytest.raises(ConfigError, match=r"give (a|its) (path|file)"):
         cfx.calibrate(given, "idm")
-    with pytest.raises(ConfigError, match=r"give a (path|file)"):
+    with pytest.raises(ConfigError, match=r"give (a|its) (path|file)"):
         cfx.evaluate("cfx://idm", given)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from cfx.core.command import Command
 from cfx.core.files import path_override
+from cfx.core.storage import path_or_url
 from cfx.errors import ConfigError
 
 _CHOSEN = {"policy": "fixed", "protocol": "within_driver"}
@@ -60,13 +61,13 @@ def overrides_of(words: Sequence[str]) -> list[str]:
         DataError: a file cannot be read, or no dataset knows its layout.
     """
     typed: list[str] = []
-    files: list[Path] = []
+    files: list[Path | str] = []
     keys = set()
     has_named_columns = False
     for word in words:
         key, is_override, value = word.partition("=")
         if not is_override:
-            files.append(Path(word).expanduser())
+            files.append(path_or_url(word))
             continue
         if key == "policy" and value not in {"fixed", "default"}:
             raise ConfigError(

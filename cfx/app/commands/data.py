@@ -133,6 +133,7 @@ def _describe(options: argparse.Namespace) -> None:
             `--style` has nothing to compare.
         DataError: a file cannot be used; or a pair stands in two of those that are compared.
     """
+    from cfx.core.storage import path_or_url
     from cfx.data.base import joined
     from cfx.data.describe import describe, describe_sites, describe_style
     from cfx.data.known import with_names
@@ -148,7 +149,7 @@ def _describe(options: argparse.Namespace) -> None:
     words = _words_to_use_it(overrides)
     read = []
     for file in files:
-        description = describe(Path(file), settings, words)
+        description = describe(path_or_url(file), settings, words)
         print(description.text, end="\n\n" if len(files) > 1 else "\n")
         if description.pairs is not None and len(description.pairs):
             read.append(description.pairs)
