@@ -121,8 +121,8 @@ class Agent:
         valid_range: the situations that each network learned from; None if they are not known.
             Outside, answers fade towards the base, or towards the pooled parameters where the head
             has no base.
-        dispersion: factor on the noise of each network, `(N,)`, found on drivers kept for
-            validation; None: 1.
+        dispersion: factor on the noise of each network, `(N,)`, with which sampled forecasts of
+            drivers kept for validation are wide enough; None: 1.
     """
 
     core: AgentCore
@@ -310,6 +310,15 @@ class Agent:
                 " none for others; train one with protocol.networks=all or protocol=across_drivers"
             )
         return self.only(torch.tensor([self.names.index(ANY_DRIVER)]))
+
+    def for_traffic(self) -> Agent:
+        """Returns the agent as it drives vehicles on roads: with the noise that was learned alone.
+
+        The factor `dispersion` makes forecasts wide enough. It stands for not knowing who drives,
+        and for what the model cannot do; a vehicle that varied so much from one second to the next
+        would be no driver. Platoons then amplify each dip, and rings jam (docs/tried.md).
+        """
+        return replace(self, dispersion=None)
 
     def only(self, numbers: Tensor) -> Agent:
         """Returns the agent with some of its networks, `(M,)` int64, which are numbered anew."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from cfx.evaluation.traffic import (
 )
 from cfx.models.idm import IDM
 from cfx.models.krauss import Krauss
+from tests.agents import adaptive
 from tests.evaluation.test_closed_loop import constant
 
 
@@ -42,6 +44,18 @@ def test_a_driver_of_krauss_has_the_traffic_of_theory() -> None:
     density, flow = found.ring[-1]
     spacing = 1000.0 / density
     assert flow == pytest.approx(3.6 * density * (spacing - VEHICLE_M) / 1.2, rel=0.02)
+
+
+@pytest.mark.slow
+def test_a_driver_who_varies_draws_with_the_seed_on_rings_and_in_platoons() -> None:
+    """Equilibria are those of the centre, and nothing is widened as forecasts are."""
+    agent = adaptive({"name": "idm"}, stochastic=True)
+    first, other = driver_traffic(agent), driver_traffic(agent, seed=1)
+    np.testing.assert_array_equal(first.equilibrium, other.equilibrium)
+    assert not np.allclose(first.dips, other.dips, atol=1e-3)
+    wide = driver_traffic(replace(agent, dispersion=torch.tensor([3.0])))
+    np.testing.assert_array_equal(wide.ring, first.ring)
+    np.testing.assert_array_equal(wide.dips, first.dips)
 
 
 def test_a_context_is_that_of_each_follower() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -80,6 +81,8 @@ def test_it_drives_as_evaluation_does(head: str, node: dict[str, Any]) -> None:
 def test_noise_counts_where_a_window_begins() -> None:
     agent = adaptive({"name": "krauss"}, stochastic=True)
     found = drive(DriverStep(agent), seed=4)
+    wide = replace(agent, dispersion=torch.tensor([3.0]))
+    assert torch.equal(drive(DriverStep(wide), seed=4), found), "forecasts alone are widened"
     torch.testing.assert_close(found, evaluated(agent, seed=4), rtol=0, atol=1e-11)
     assert (found - drive(DriverStep(agent))).abs().max() > 0.01
 

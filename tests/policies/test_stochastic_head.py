@@ -280,6 +280,14 @@ def test_dispersion_widens_the_noise_and_is_saved(tmp_path: Path) -> None:
     assert moves[1] == pytest.approx([2.0 * move for move in moves[0]], rel=1e-6)
 
 
+def test_vehicles_on_a_road_vary_as_was_learned_not_as_wide_as_forecasts() -> None:
+    agent = adaptive(KRAUSS, stochastic=True)
+    wide = replace(agent, dispersion=torch.tensor([3.0]))
+    state = agent.begin(torch.zeros(1, dtype=torch.int64))
+    assert not torch.equal(act(wide, state, 0)[0], act(agent, state, 0)[0])
+    assert torch.equal(act(wide.for_traffic(), state, 0)[0], act(agent, state, 0)[0])
+
+
 def test_a_saved_policy_draws_as_it_did(tmp_path: Path) -> None:
     agent = adaptive(KRAUSS, ("one", "two"), stochastic=True)
     checkpoint.save_agent(agent, tmp_path)

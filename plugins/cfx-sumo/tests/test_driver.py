@@ -559,6 +559,12 @@ def test_what_is_drawn_for_a_vehicle_depends_on_no_other_vehicle() -> None:
     assert other["v0"] != alone["v0"]
 
 
+def test_the_factor_that_widens_forecasts_does_not_drive() -> None:
+    policy = adaptive({"name": "krauss"}, stochastic=True)
+    wide = replace(policy, dispersion=torch.tensor([3.0]))
+    assert drawn_speeds(Driver(wide), ["v0", "v1"]) == drawn_speeds(Driver(policy), ["v0", "v1"])
+
+
 def test_a_driver_begins_anew_where_time_goes_back() -> None:
     driver = Driver(adaptive({"name": "krauss"}, stochastic=True))
     first = drawn_speeds(driver, ["v0", "v1"], 7)
