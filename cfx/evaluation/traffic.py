@@ -331,7 +331,7 @@ def driver_traffic(
         recorded: flows to compare equilibria with; None: none.
         seed: of starts, and of what is drawn.
     """
-    agent = agent.for_unseen_drivers().for_traffic()
+    agent = agent.for_unseen_drivers().for_live_driving()
     if model is None:
         model = cast(DrivingModel, create("model", agent.model_node))
     flows = equilibrium_flows(agent, model)

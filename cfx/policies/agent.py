@@ -311,12 +311,12 @@ class Agent:
             )
         return self.only(torch.tensor([self.names.index(ANY_DRIVER)]))
 
-    def for_traffic(self) -> Agent:
-        """Returns the agent as it drives vehicles on roads: with the noise that was learned alone.
+    def for_live_driving(self) -> Agent:
+        """Returns the agent as it drives vehicles live: with the noise that was learned alone.
 
-        The factor `dispersion` makes forecasts wide enough. It stands for not knowing who drives,
-        and for what the model cannot do; a vehicle that varied so much from one second to the next
-        would be no driver. Platoons then amplify each dip, and rings jam (docs/tried.md).
+        The factor `dispersion` makes forecasts wide enough. For a driver of whom nothing is known
+        it stands for not knowing who drives, too; a vehicle that varied so much from one second to
+        the next would be no driver. Platoons then amplify each dip, and rings jam (docs/tried.md).
         """
         return replace(self, dispersion=None)
 

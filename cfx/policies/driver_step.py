@@ -82,7 +82,7 @@ class DriverStep:
     """Advances drivers of one network by one time step after the other.
 
     State is passed in and returned, never kept. It is the closed loop in which cfx evaluates a
-    policy, to the last bits; with noise, that of one driver (`Agent.for_traffic`).
+    policy, to the last bits; with noise, that of one driver (`Agent.for_live_driving`).
 
     On a free road, where the gap is infinity, the policy's own model drives with
     `Agent.free_road_parameters`, and what is said of a leader does not count. Behind the next
@@ -107,7 +107,7 @@ class DriverStep:
     """
 
     def __init__(self, agent: Agent, context: DriverContext = UNSEEN) -> None:
-        self.agent = agent.for_unseen_drivers().for_traffic()
+        self.agent = agent.for_unseen_drivers().for_live_driving()
         model = create("model", agent.model_node)
         assert isinstance(model, DrivingModel)
         if model.needs_simulator:

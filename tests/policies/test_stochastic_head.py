@@ -285,7 +285,7 @@ def test_vehicles_on_a_road_vary_as_was_learned_not_as_wide_as_forecasts() -> No
     wide = replace(agent, dispersion=torch.tensor([3.0]))
     state = agent.begin(torch.zeros(1, dtype=torch.int64))
     assert not torch.equal(act(wide, state, 0)[0], act(agent, state, 0)[0])
-    assert torch.equal(act(wide.for_traffic(), state, 0)[0], act(agent, state, 0)[0])
+    assert torch.equal(act(wide.for_live_driving(), state, 0)[0], act(agent, state, 0)[0])
 
 
 def test_a_saved_policy_draws_as_it_did(tmp_path: Path) -> None:

@@ -103,7 +103,8 @@ def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated() -> None:
     assert not torch.equal(chosen(1), chosen(2))
     assert not torch.equal(chosen(1)[0], chosen(1)[1])
     centre = chosen(None)
-    assert torch.equal(centre[0], centre[1])
+    # Equal rows of a matrix product may differ in their last bits.
+    torch.testing.assert_close(centre[0], centre[1], rtol=1e-6, atol=1e-9)
     rows = ready.card_of(name)["distributions"]
     assert [row["horizon_s"] for row in rows] == [0.5, 1.0, 2.0, 3.0, 5.0, 10.0]
     for row in rows:

@@ -141,8 +141,7 @@ class TrafficProtocol(FoldsOrFinished):
     - `pooled_ar`, `driver_specific_ar`: the same with AR(1) noise on the acceleration, measured on
       all drivers, or on the driver, or as `noise` says;
     - `policy`: the policy, driven at its centre where it is stochastic;
-    - `policy_sampled`: the same, drawn with the job's seed, of a stochastic policy, without the
-      factor that makes its forecasts wide enough.
+    - `policy_sampled`: the same, drawn with the job's seed, of a stochastic policy.
 
     Before the start a policy has observed the first part of the driver's trajectory, as before the
     test part (`history` bounds it), and it drives with the network of the driver's fold, which has
@@ -285,7 +284,7 @@ class TrafficProtocol(FoldsOrFinished):
             state = _observed(test, test.policy, test.network)
             kinds["policy"] = _Kind(test.policy, state, draws=False)
             if test.policy.core.head.is_stochastic:
-                kinds["policy_sampled"] = _Kind(test.policy.for_traffic(), state, draws=True)
+                kinds["policy_sampled"] = _Kind(test.policy, state, draws=True)
         return kinds
 
     def _described(self, lanes: roads.Lanes, traffic: Measured) -> dict[str, Any]:

@@ -74,8 +74,8 @@ RECIPES = {
             "learner.ensemble_size=2",  # its trajectories are simulated several times
         ),
         "Intelligent Driver Model for people on any road, unseen, who vary: each draws their own"
-        " parameters and noise, with a seed. For forecasts; in traffic its platoons amplify a dip"
-        " and queues leave slowly, so take idm there.",
+        " parameters and noise, with a seed. For forecasts, and for traffic that makes its own"
+        " waves; above 25 m/s its gaps are smaller than people's.",
         PEOPLE,
     ),
     "idm-acc": Recipe(
