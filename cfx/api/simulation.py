@@ -83,8 +83,9 @@ def simulate(
         where it starts from.
 
     Raises:
-        CfxError: a parameter is unknown or no finite number, a row is missing, the leader is no
-            time series, a start is negative, or a setting or argument does not belong to the rest.
+        CfxError: a parameter is unknown, outside its bounds or no finite number, a row is missing,
+            the leader is no time series, a start is negative, or a setting or argument does not
+            belong to the rest.
 
     Examples:
         >>> import cfx
@@ -225,7 +226,7 @@ def _behind(
     start = float(speeds[0]) if speed is None else _not_negative("speed", speed, "m/s")
     default_gap = _STANDSTILL_M + _TIME_GAP_S * start
     first_gap = default_gap if gap is None else _not_negative("gap", gap, "m")
-    # Only the first frame of the follower is read: its other values are never compared with.
+    # Of the follower the first frame alone is read, where it starts.
     zeros = np.zeros(len(time))
     pairs = []
     for name in names:
