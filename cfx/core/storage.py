@@ -63,7 +63,7 @@ def path_or_url(written: str | Path) -> Path | str:
         ConfigError: nothing is written.
     """
     if not str(written).strip():
-        raise ConfigError("the name of the file is empty; give its path or URL")
+        raise ConfigError("the name of the file is empty; give a path or URL")
     return str(written) if is_url(str(written)) else Path(written).expanduser()
 
 

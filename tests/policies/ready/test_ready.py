@@ -103,6 +103,8 @@ def test_stochastic_drivers_vary_with_the_seed_and_are_calibrated() -> None:
     assert not torch.equal(chosen(1), chosen(2))
     assert not torch.equal(chosen(1)[0], chosen(1)[1])
     centre = chosen(None)
+    state = agent.begin(torch.zeros(2, dtype=torch.int64))
+    assert not agent.act(history, state)[1].latent.any(), "nothing is drawn"
     # Equal rows of a matrix product may differ in their last bits.
     torch.testing.assert_close(centre[0], centre[1], rtol=1e-6, atol=1e-9)
     rows = ready.card_of(name)["distributions"]

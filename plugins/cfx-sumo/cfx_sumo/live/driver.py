@@ -197,7 +197,8 @@ class Driver:
             raise DataError(
                 f"look_ahead={look_ahead:g}: give a distance above 0 m within which a leader counts"
             )
-        self.policy = policy = policy.for_live_driving()
+        policy = policy.for_live_driving()
+        self.policy = policy
         self.look_ahead = look_ahead
         self.source = source
         self.model = model or cast(DrivingModel, registry.create("model", policy.model_node))
