@@ -43,6 +43,7 @@ ONE = "learner.ensemble_size=1"
 PAPER = "experiment=paper/pairs hydra.mode=RUN"
 CALIBRATION = f"policy=fixed protocol=within_driver {RECONSTRUCTED} data.min_duration=70"
 FORECAST = f"model=idm protocol=forecast protocol.histories=[] {RECONSTRUCTED} data.min_duration=70"
+KEPT_BACK = f"{RECONSTRUCTED} data.recording=i80-0400 data.min_duration=70"
 TRANSFER = f"protocol=transfer protocol.run={FOLDER}/history-krauss-0500"
 
 
@@ -61,6 +62,23 @@ JOBS = {
     "main-2": Job("IDM", "seed=2"),
     "paper-krauss": Job("Krauss, the paper's training", f"{PAPER} model=krauss {RECONSTRUCTED}"),
     "paper-w99": Job("Wiedemann 99, the paper's training", f"{PAPER} model=w99 {RECONSTRUCTED}"),
+    **{
+        f"clusters-{model}-{cluster}": Job(
+            f"{name}, {cluster}",
+            "experiment=paper/clusters hydra.mode=RUN"
+            f" model={model} style.cluster={cluster} {RECONSTRUCTED}",
+        )
+        for model, name in {"krauss": "Krauss", "w99": "Wiedemann 99"}.items()
+        for cluster in ("conservative", "normal", "aggressive")
+    },
+    "pairs-krauss": Job(
+        "Krauss, cfx's imitation",
+        f"experiment=pairs hydra.mode=RUN model=krauss {RECONSTRUCTED} data.min_duration=70",
+    ),
+    "pairs-w99": Job(
+        "Wiedemann 99, cfx's imitation",
+        f"experiment=pairs hydra.mode=RUN model=w99 {RECONSTRUCTED} data.min_duration=70",
+    ),
     "adaptive-krauss": Job(
         "Krauss, with history (`adaptive`)",
         "experiment=adaptive hydra.mode=RUN model=krauss learner=rollout"
@@ -103,7 +121,7 @@ JOBS = {
     ),
     "transfer-0400": Job(
         "at 4:00 pm, reconstructed",
-        f"{TRANSFER} {RECONSTRUCTED} data.recording=i80-0400 data.min_duration=70",
+        f"{TRANSFER} {KEPT_BACK}",
     ),
     "transfer-0400-raw": Job(
         "at 4:00 pm, raw",
@@ -149,6 +167,20 @@ JOBS = {
         f"policy=ukf policy.residual=true {FORECAST} protocol.leader=constant_speed",
     ),
     "stochastic-idm": Job("IDM", f"experiment=stochastic model=idm learner.drivers=32 {I80}"),
+    "stochastic-krauss": Job(
+        "Krauss", f"experiment=stochastic model=krauss learner.drivers=32 {I80}"
+    ),
+    "stochastic-w99": Job("Wiedemann 99", f"experiment=stochastic model=w99 {I80}"),
+    "stochastic-idm-0500": Job(
+        "IDM, 5:00 pm",
+        "experiment=stochastic model=idm learner.drivers=32"
+        f" {RECONSTRUCTED} data.recording=i80-0500 {LONG}",
+    ),
+    "forecast-0400": Job(
+        "at 4:00 pm",
+        f"protocol=forecast protocol.run={FOLDER}/stochastic-idm-0500 protocol.samples=50"
+        f" {KEPT_BACK}",
+    ),
 }
 """By key. Files are in the folder of recordings."""
 
