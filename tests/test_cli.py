@@ -166,7 +166,7 @@ def test_ctrl_c_and_sigterm_have_their_exit_codes(run: Run, seed: int, code: int
         (["model=krauss,w99"], "model=krauss,w99: several values need a multirun; add -m"),
         (["seed=choice(1,2)"], "seed=choice(1,2): several values need a multirun; add -m"),
         (["seed=[1"], "seed=[1: cannot be read as key=value (no viable alternative at input '[1')"),
-        (["model=3"], "choose an option by its name, such as model=w99"),
+        (["experiment=3"], "choose an option by its name, such as model=w99"),
         (["seed=${nowhere}"], "Interpolation key 'nowhere' not found"),
         (["hydra.run.dir=outputs/${nowhere}"], "Interpolation key 'nowhere' not found"),
         (
@@ -189,6 +189,23 @@ def test_a_wrong_command_line_is_one_sentence_and_exit_code_2(
     assert message in printed
     assert len(printed.splitlines()) == 1
     assert os.environ.get("HYDRA_FULL_ERROR") is None
+
+
+@pytest.mark.parametrize(
+    ("argument", "message"),
+    [
+        ("model=3", "model=3: choose a model by its name, or leave it out; known: "),
+        ("policy=null", "policy=null: choose a policy by its name, or leave it out; known: "),
+        ("model=[idm,w99]", "a job has one model; several need a multirun (-m model=idm,w99)"),
+        ("policy=cfx://idm", "is tested by protocol=transfer protocol.run=cfx://idm"),
+        ("data=i-80/pairs.csv", "write the file as data.path=i-80/pairs.csv"),
+    ],
+)
+def test_a_component_is_chosen_by_one_name(argument: str, message: str, capsys) -> None:
+    assert cli.main([argument]) == 2
+    printed = capsys.readouterr().err
+    assert message in printed
+    assert len(printed.splitlines()) == 1
 
 
 def test_a_flag_that_does_not_exist_exits_with_2(run: Run, capsys) -> None:

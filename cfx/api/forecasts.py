@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from numbers import Real
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -142,11 +143,9 @@ def forecast(
                 " a stochastic one: cfx.train(pairs, for_='stochastic')"
             )
         origins = _origins(context, at)
-        frames = round(horizon / context.batch.dt) if math.isfinite(horizon) else 0
+        frames = round(_seconds("horizon", horizon) / context.batch.dt)
         if frames < 1:
-            raise ConfigError(
-                f"horizon={horizon:g}: give one step of {context.batch.dt:g} s or more"
-            )
+            raise ConfigError(f"horizon={horizon}: give one step of {context.batch.dt:g} s or more")
         generators: list[torch.Generator | None] = []
         for number in range(samples):
             generators.append(torch.Generator().manual_seed(seed * 1_000_003 + number))
@@ -177,9 +176,7 @@ def _origins(context: ProtocolContext, at: float) -> Origins:
     from cfx.evaluation.forecasts import Origins
 
     batch = context.batch
-    if not math.isfinite(at):
-        raise ConfigError(f"at={at}: give a moment in seconds")
-    frame = round(at / batch.dt)
+    frame = round(_seconds("at", at) / batch.dt)
     for pair in context.pairs:
         if not 1 <= frame < len(pair) - 1:
             raise ConfigError(
@@ -188,6 +185,17 @@ def _origins(context: ProtocolContext, at: float) -> Origins:
             )
     everyone = torch.arange(len(batch), device=batch.lengths.device)
     return Origins(everyone, torch.full_like(everyone, frame))
+
+
+def _seconds(name: str, value: Any) -> float:
+    """Returns a number of seconds.
+
+    Raises:
+        ConfigError: it is no finite number.
+    """
+    if isinstance(value, Real) and math.isfinite(value):
+        return float(value)
+    raise ConfigError(f"{name}={value}: give a moment in seconds")
 
 
 def _tables(

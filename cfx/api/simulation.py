@@ -154,12 +154,19 @@ def _rows_of(parameters: Parameters) -> pd.DataFrame | dict[str, float]:
     """Returns a row of values for each follower, by its name, or one set for all.
 
     Raises:
-        ConfigError: there are no rows, or two of one name.
+        ConfigError: they have no names, there are no rows, or two of one name.
     """
     if isinstance(parameters, Fit):
         parameters = parameters.parameters
+    if parameters is None:
+        return {}
+    if isinstance(parameters, Mapping | pd.Series):
+        return dict(parameters)
     if not isinstance(parameters, pd.DataFrame):
-        return {} if parameters is None else dict(parameters)
+        raise ConfigError(
+            f"parameters: a {type(parameters).__name__} does not say which is which; give values by"
+            " name ({'T': 1.2}), a data frame with a row for each follower, or a fit"
+        )
     if "pair_id" in parameters:
         parameters = parameters.set_index("pair_id")
     if not len(parameters):

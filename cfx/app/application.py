@@ -39,7 +39,7 @@ from cfx.app.sweep.folder import (
     new_folder,
     only_one,
 )
-from cfx.app.user_errors import explain, explained, is_user_error
+from cfx.app.user_errors import explain, explained, is_user_error, refuse_choices
 from cfx.core.console import console_logging
 from cfx.core.guest import default_torch, guest, in_turn, own_hydra
 from cfx.core.memory import is_out_of_memory
@@ -218,9 +218,9 @@ def _refuse(arguments: Sequence[str]) -> None:
     """Refuses what Hydra would act upon before a job can.
 
     Raises:
-        ConfigError: a password in `tracking.uri`, which Hydra writes into the job's folder; a URL
-            where Hydra would make a folder of that name; or a working directory whose name it would
-            take for an interpolation.
+        ConfigError: a component is not chosen by its name; a password in `tracking.uri`, which
+            Hydra writes into the job's folder; a URL where Hydra would make a folder of that name;
+            or a working directory whose name it would take for an interpolation.
     """
     folder = str(Path.cwd())
     if "${" in folder:
@@ -228,6 +228,7 @@ def _refuse(arguments: Sequence[str]) -> None:
             f"the working directory {folder} holds '${{', which Hydra replaces in paths; start from"
             " another folder"
         )
+    refuse_choices(arguments)
     for argument in arguments:
         key, _, value = argument.partition("=")
         public = without_passwords(value)

@@ -12,13 +12,28 @@ from cfx.app import hydra_source
 from cfx.app.user_errors import explained
 from cfx.core import registry
 from cfx.core.files import IN_MEMORY, quoted
-from cfx.errors import DataError
+from cfx.errors import ConfigError, DataError
 from cfx.results.config import JobConfig
 
 
 def override(key: str, value: Any) -> str:
-    """Returns the override `key=value` in Hydra's grammar, such as `data.min_duration=30`."""
-    return f"{key}={_text(value)}"
+    """Returns the override `key=value` in Hydra's grammar, such as `data.min_duration=30`.
+
+    Raises:
+        ConfigError: the value is nothing that a configuration can hold.
+    """
+    try:
+        return f"{key}={_text(value)}"
+    except TypeError:
+        given, advice = f"a {type(value).__name__}", ""
+        if isinstance(value, type):
+            given = f"the class {value.__name__}"
+        if key == "model":
+            advice = "; a class of yours gets a name by @cfx.model(NAME)"
+        raise ConfigError(
+            f"{key}: a setting is a text, a number, None, or a list or mapping of these, not"
+            f" {given}{advice}"
+        ) from None
 
 
 def config_of(settings: Mapping[str, Any]) -> JobConfig:
@@ -100,7 +115,13 @@ def _differences(prefix: str, values: Mapping[str, Any], usual: Mapping[str, Any
 
 
 def _text(value: Any) -> str:
-    """Returns a value in Hydra's grammar."""
+    """Returns a value in Hydra's grammar.
+
+    Raises:
+        TypeError: a configuration cannot hold it.
+    """
+    if hasattr(value, "tolist"):  # a number or an array of NumPy's, a series, a tensor
+        value = value.tolist()
     if isinstance(value, str | Path):
         text = str(value)
         # Without quotes Hydra would read such a text as a Boolean, as null or as a number.
@@ -116,4 +137,6 @@ def _text(value: Any) -> str:
         return "[" + ", ".join(_text(item) for item in value) + "]"
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
-    return repr(value)
+    if isinstance(value, int | float):
+        return repr(value)
+    raise TypeError

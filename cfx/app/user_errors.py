@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import re
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import yaml
@@ -42,14 +44,61 @@ def explained(overrides: Sequence[str]) -> Iterator[None]:
     """Composes a configuration in the block.
 
     Raises:
-        ConfigError: what Hydra says of the overrides, in one sentence.
+        ConfigError: what Hydra says of the overrides, in one sentence; or an override chooses a
+            component otherwise than by its name.
     """
+    refuse_choices(overrides)
     try:
         yield
     except Exception as error:
         if is_user_error(error) and not isinstance(error, CfxError):
             raise ConfigError(explain(error, overrides)) from None
         raise
+
+
+def refuse_choices(overrides: Sequence[str]) -> None:
+    """Refuses overrides that choose a component otherwise than by its name.
+
+    Hydra would merge the settings of several options into one, and does not say where it has found
+    null or a number, nor that a path is none of its options.
+
+    Raises:
+        ConfigError: the first of them.
+    """
+    for override in overrides:
+        key, _, value = override.partition("=")
+        group, value = key.lstrip("+"), value.strip(" '\"")
+        if group not in registry.GROUPS or not value:
+            continue
+        kind = registry.GROUPS[group].name
+        if value.startswith("["):
+            raise ConfigError(
+                f"{override}: a job has one {kind}; several need a multirun"
+                f" (-m {group}={value.strip('[]')}), in Python a call for each"
+            )
+        is_file = "/" in value or (Path(value).suffix and Path(value).is_file())
+        if group == "data" and is_file:
+            raise ConfigError(
+                f"{override}: write the file as data.path={value}, and its layout as data=tidy or"
+                " as another that cfx data describe names"
+            )
+        if group in {"model", "policy"} and is_file:
+            raise ConfigError(
+                f"{override}: choose a {kind} by its name; a finished policy, which brings its"
+                f" model, is tested by protocol=transfer protocol.run={value}, in Python by"
+                " cfx.evaluate"
+            )
+        if value == "null" or _is_number(value):
+            raise ConfigError(
+                f"{override}: choose a {kind} by its name, or leave it out; known:"
+                f" {', '.join(registry.names(kind))}"
+            )
+
+
+def _is_number(text: str) -> bool:
+    with contextlib.suppress(ValueError):
+        return math.isfinite(float(text))
+    return False
 
 
 def explain(error: BaseException, overrides: Sequence[str]) -> str:

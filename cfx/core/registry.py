@@ -336,8 +336,8 @@ def add(kind: str, name: str, cls: type[Component]) -> None:
     One that was added under the same name before is replaced.
 
     Raises:
-        PluginError: an installed distribution brings a component of that name, or the class breaks
-            the contract of its kind.
+        PluginError: an installed distribution brings a component of that name, or what is given is
+            no class or breaks the contract of its kind.
     """
     about = kind_of(kind)
     for other in _of_kind(about):
@@ -345,6 +345,8 @@ def add(kind: str, name: str, cls: type[Component]) -> None:
             raise PluginError(
                 f"{other} is installed, and {about.call(name)} means it; choose another name"
             )
+    if not isinstance(cls, type):
+        raise PluginError(f"{about.call(name)}: a {about.name} is a class, not {cls!r}")
     target = f"{cls.__module__}:{cls.__qualname__}"
     announced = Entry(about.name, name, target, THIS_PROCESS, str(next(_additions)), "")
     _check(announced, cls)

@@ -154,7 +154,7 @@ class FileDatasetSettings(DatasetSettings):
             written = (written,)
         files: list[Path] = []
         for path in written:
-            for file in _matching(path):
+            for file in matching(path):
                 if file in files:
                     raise DataError(
                         f"data.path: {file} is named more than once; name each file once"
@@ -167,7 +167,7 @@ _PATTERN = re.compile(r"[*?\[]")
 """What makes a path a pattern of file names."""
 
 
-def _matching(path: Path | str) -> list[Path]:
+def matching(path: Path | str) -> list[Path]:
     """Returns the files that a path, a URL or a pattern stands for, sorted by name."""
     if isinstance(path, str):
         return local_copies(path)

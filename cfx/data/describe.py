@@ -19,8 +19,7 @@ from cfx.core import registry
 from cfx.core.distributions import OWN
 from cfx.core.files import path_override
 from cfx.core.registry import Entry
-from cfx.core.storage import local_copies
-from cfx.data.base import Contents, Dataset, rounded_down
+from cfx.data.base import Contents, Dataset, matching, rounded_down
 from cfx.data.check import Check, judge
 from cfx.data.files import Floats, Ints, beginning, has_letters, partitions
 from cfx.data.pairs import (
@@ -100,7 +99,7 @@ def describe(
     whether it is its own, those of plugins too.
 
     Args:
-        source: a file or folder, or a file's URL.
+        source: a file or folder, a file's URL, or a pattern of several.
         settings: of the dataset that reads it, and its `name`.
         options: what stands on the command line for these settings, after a blank.
 
@@ -327,13 +326,13 @@ def dataset_of(source: Path | str) -> str:
     """Returns the name of the dataset that reads a file; cfx's own are asked before plugins'.
 
     Args:
-        source: a file or folder; or the URL of a file, or of several as a pattern, of which the
-            first is looked at.
+        source: a file or folder, or the URL of a file; or a pattern of several, of which the first
+            is looked at.
 
     Raises:
         DataError: it cannot be read, or has columns that none of them knows.
     """
-    path = local_copies(source)[0] if isinstance(source, str) else source
+    path = matching(source)[0]
     start = beginning(path)
     layouts = []
     # Sorting is stable: cfx's own come first, each group by name.

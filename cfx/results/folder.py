@@ -47,7 +47,7 @@ def begin(folder: Path, config: JobConfig) -> None:
     except OSError as error:
         raise OutputError(
             f"cannot make the output folder {folder}: {error.strerror};"
-            " set hydra.run.dir to a place that can be written"
+            " name a folder that can be written (of a job: hydra.run.dir=FOLDER)"
         ) from error
     with writing(folder):
         remove_leftovers(folder)

@@ -261,6 +261,15 @@ def test_a_recording_says_its_layout_itself(pairs: cfx.Pairs) -> None:
     assert read.dropped["count"].tolist() == [1]
 
 
+def test_a_pattern_stands_for_its_files(pairs: cfx.Pairs, tmp_path: Path) -> None:
+    first, *others = pairs.summary.index
+    pairs.select([first]).save(tmp_path / "a.csv")
+    pairs.select(others).save(tmp_path / "b.csv")
+    assert list(cfx.read(tmp_path / "*.csv", min_duration=0).summary.index) == [first, *others]
+    with pytest.raises(DataError, match="no file matches this pattern"):
+        cfx.read(tmp_path / "*.txt")
+
+
 def test_columns_and_units_of_ones_own_are_mapped(pairs: cfx.Pairs) -> None:
     frame = pairs.frame.rename(columns={"follower_speed_mps": "v"})
     frame["v"] *= 3.6
@@ -351,6 +360,8 @@ REFUSED: list[tuple[type[CfxError], str, dict[str, Any]]] = [
     (DataError, "constant step", {"leader": LEADER.iloc[[0, 1, 5]]}),
     (DataError, "0 or more", {"leader": LEADER.assign(speed=-1.0)}),
     (ConfigError, "parameters: there are no rows", {"parameters": NOBODY, "leader": LEADER}),
+    (ConfigError, "a ndarray does not say which", {"parameters": np.ones(5), "leader": LEADER}),
+    (ConfigError, "a str does not say which", {"parameters": "cfx://idm", "leader": LEADER}),
     (ConfigError, "give recorded pairs", {}),
     (ConfigError, "give a leader", {"gap": 3.0}),
     (ConfigError, "at=1000", {"leader": LEADER, "at": 1000.0}),
@@ -393,13 +404,18 @@ def test_a_wrong_setting_is_answered_as_on_the_command_line(pairs: cfx.Pairs) ->
         cfx.calibrate(pairs, objective="gap_rmes")
     with pytest.raises(ConfigError, match="seed"):
         cfx.calibrate(pairs, seed=-1)
+    with pytest.raises(ConfigError, match="not the class Pairs; a class of yours gets a name"):
+        cfx.train(pairs, cfx.Pairs)  # type: ignore[arg-type]  # what is tested
+    with pytest.raises(ConfigError, match=r"split: a setting is a text, .*, not a set"):
+        cfx.calibrate(pairs, split={0.5})
 
 
 TEXTS = ("idm", "1", "true", "null", "", "a b", "it's", "a=b", "x: y", r"c:\d")
+NUMPYS = (np.float64(0.1), np.int64(3), np.bool_(True))
 VALUES = (0.1, 3, None, True, [1, 2.5], {"T": {"low": 0.5}}, ["a", "b c"], Path("/a b/c"))
 
 
-@pytest.mark.parametrize("value", [*TEXTS, *VALUES])
+@pytest.mark.parametrize("value", [*TEXTS, *VALUES, *NUMPYS])
 def test_an_override_means_its_value(value: Any) -> None:
     from hydra.core.override_parser.overrides_parser import OverridesParser
 

@@ -75,3 +75,5 @@ def test_an_installed_name_and_a_broken_class_are_refused() -> None:
 
     with pytest.raises(PluginError, match="does not implement next_speed"):
         cfx.model("empty")(Empty)
+    with pytest.raises(PluginError, match="model=three: a model is a class, not 3"):
+        cfx.model("three")(3)  # type: ignore[type-var]  # what is tested

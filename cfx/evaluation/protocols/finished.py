@@ -138,8 +138,7 @@ class FinishedPolicy:
             raise DataError(
                 f"{where}: this policy has learned from {len(learned_pairs)} of the {len(pairs)}"
                 f" pairs in {pairs.source}, the first of them '{learned_pairs[0]}'; test it on"
-                " others"
-                " (data.recording, data.pair_ids)"
+                " others (data.recording, data.pair_ids; in Python pairs.select)"
             )
         if not policy.trained_on.pairs:
             log.info(
