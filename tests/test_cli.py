@@ -436,6 +436,7 @@ def test_main_takes_its_arguments_from_the_command_line(
         (["plugins", "show", "model", "w98"], "Did you mean 'w99'"),
         (["plugins", "show", "mdl", "w99"], "Did you mean 'model'"),
         (["data", "describe", "nowhere.csv"], "nowhere.csv"),
+        (["calibrate", "."], "is a folder that no dataset reads as a whole; name the files in it"),
     ],
     ids=lambda value: " ".join(value) if isinstance(value, list) else "",
 )

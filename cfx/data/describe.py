@@ -355,12 +355,15 @@ def dataset_of(source: Path | str) -> str:
             f"{source}: is XML, of which SUMO's FCD output alone is read (<fcd-export>); write a"
             " table as CSV or parquet (docs/how-to/own-recording.md)"
         )
-    has_names = has_letters("".join(start.columns))
-    if start.path.is_dir() or has_names:
-        columns = listed(start.columns, 20) or "none: it is a folder"
+    if start.path.is_dir():
         raise DataError(
-            f"{source}: no dataset knows this layout. Columns found: {columns}. Known layouts:"
-            f" {'; '.join(layouts)}. {_own_columns(source, start.columns)}"
+            f"{source}: is a folder that no dataset reads as a whole; name the files in it, or give"
+            f" a pattern such as '{start.path / '*.csv'}'. Known layouts: {'; '.join(layouts)}."
+        )
+    if has_letters("".join(start.columns)):
+        raise DataError(
+            f"{source}: no dataset knows this layout. Columns found: {listed(start.columns, 20)}."
+            f" Known layouts: {'; '.join(layouts)}. {_own_columns(source, start.columns)}"
         )
     return "ngsim"  # whose reader says what is wrong with a file without column names
 

@@ -141,6 +141,8 @@ def _drive(options: argparse.Namespace) -> None:
     from cfx_sumo.drive.run import parse_drivers, report, run_scenario
     from cfx_sumo.drive.scenarios import SCENARIOS
 
+    if options.step is not None and not 0.01 <= options.step <= 1:
+        raise ConfigError(f"--step {options.step:g}: give 0.01 to 1 s")
     output = None
     if options.output:
         output = Path(options.output).expanduser()

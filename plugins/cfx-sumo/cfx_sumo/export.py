@@ -17,6 +17,7 @@ from torch import Tensor
 from cfx.errors import ConfigError, DataError, listed
 from cfx.plugin import (
     COARSE_S,
+    READY_FOLDER,
     DrivingModel,
     ExportFormat,
     InSumo,
@@ -174,7 +175,16 @@ def _folder(run: str | Path) -> tuple[Path, Path]:
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Reads the model's node, and the rows of `driver_specific`, calmest cluster first."""
+    """Reads the model's node, and the rows of `driver_specific`, calmest cluster first.
+
+    Raises:
+        DataError: there is no finished job, or it has no driver-specific parameters.
+    """
+    if READY_FOLDER in folder.parents:
+        raise DataError(
+            f"cfx://{folder.name}: a ready-made policy has no driver-specific parameters; export a"
+            " job that calibrated some, or drive with the policy itself (cfx drive)"
+        )
     job_folder.examine(folder)
     try:
         node = job_folder.parse_yaml((folder / "config.yaml").read_text(encoding="utf-8"))["model"]

@@ -153,6 +153,9 @@ def test_mistakes_are_reported_before_sumo_starts(
         parse_drivers(["calm=a", "calm=b"])
     assert parse_drivers(["a=b=c"]) == {"a": "b=c"}
     handlers = list(logging.getLogger("cfx").handlers)
+    for step in ("-1", "2", "nan"):
+        assert main(["drive", "--step", step]) == 2
+        assert capsys.readouterr().err == f"--step {step}: give 0.01 to 1 s\n"
     assert main(["drive", "nowhere.sumocfg", "--drivers", "calm=calm"]) == 2
     assert "nowhere.sumocfg is not there" in capsys.readouterr().err
     with monkeypatch.context() as without:

@@ -328,6 +328,8 @@ def test_what_cannot_be_exported_is_one_sentence(
         export(job(tmp_path / "vissim", {"name": "w99", "variant": "vissim"}))
     assert main(["export", str(tmp_path), "--to", "sumo"]) == 2
     assert "holds no finished job" in capsys.readouterr().err
+    assert main(["export", "cfx://idm", "--to", "sumo"]) == 2
+    assert "a ready-made policy has no driver-specific parameters" in capsys.readouterr().err
     folder = job(tmp_path / "job", {"name": "w99"})
     with pytest.raises(OutputError, match="name another --output"):
         export(folder, folder / "config.yaml" / "x.add.xml")

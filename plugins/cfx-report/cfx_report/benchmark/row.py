@@ -72,6 +72,8 @@ class Row:
         Raises:
             DataError: the file is none.
         """
+        if not path.is_file():
+            raise DataError(f"{path}: there is no such file; give a row's folder, or its file")
         try:
             return cls.of(json.loads(path.read_text(encoding="utf-8")))
         except (OSError, ValueError, TypeError, KeyError, AttributeError) as error:

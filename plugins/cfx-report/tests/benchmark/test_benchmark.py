@@ -130,6 +130,8 @@ def test_a_row_reads_back(tmp_path: Path) -> None:
     (tmp_path / "broken.json").write_text("{}")
     with pytest.raises(DataError, match="is no row of the benchmark"):
         Row.read(tmp_path / "broken.json")
+    with pytest.raises(DataError, match="there is no such file; give a row's folder"):
+        Row.read(tmp_path / "nowhere.json")
 
 
 def test_a_comparison_is_pair_by_pair(tmp_path: Path) -> None:

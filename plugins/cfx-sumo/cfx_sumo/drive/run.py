@@ -943,7 +943,7 @@ def parse_drivers(arguments: Sequence[str]) -> dict[str, str]:
         if not (name and equals and run):
             raise ConfigError(
                 f"--drivers {argument}: write TYPE=RUN, a vType of the scenario and a job's output"
-                " folder"
+                " folder or a ready-made policy, such as car=cfx://idm"
             )
         if name in runs:
             raise ConfigError(f"--drivers: vType '{name}' stands twice")
