@@ -138,7 +138,8 @@ def _drive(options: argparse.Namespace) -> None:
     # None is Python's own way to say that a module is not there.
     sys.modules.setdefault("pyarrow", None)  # type: ignore[arg-type]
     from cfx.plugin import console
-    from cfx_sumo.drive.run import parse_drivers, report, run_scenario
+    from cfx_sumo.drive.printed import report
+    from cfx_sumo.drive.run import run_scenario
     from cfx_sumo.drive.scenarios import SCENARIOS
 
     if options.step is not None and not 0.01 <= options.step <= 1:
@@ -221,3 +222,23 @@ def _measure_traffic(options: argparse.Namespace, runs: dict[str, str]) -> None:
     words += ["--traffic", "FOLDER"]
     write_traffic(report, folder, shlex.join(words))
     print(f"Tables and figure: {folder}")
+
+
+def parse_drivers(arguments: Sequence[str]) -> dict[str, str]:
+    """Reads `TYPE=RUN` arguments.
+
+    Raises:
+        ConfigError: one is not of this form, or names a vType twice.
+    """
+    runs: dict[str, str] = {}
+    for argument in arguments:
+        name, equals, run = argument.partition("=")
+        if not (name and equals and run):
+            raise ConfigError(
+                f"--drivers {argument}: write TYPE=RUN, a vType of the scenario and a job's output"
+                " folder or a ready-made policy, such as car=cfx://idm"
+            )
+        if name in runs:
+            raise ConfigError(f"--drivers: vType '{name}' stands twice")
+        runs[name] = run
+    return runs

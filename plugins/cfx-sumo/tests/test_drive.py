@@ -14,16 +14,11 @@ from cfx.app.cli import main
 from cfx.core.distributions import install_line
 from cfx.errors import ConfigError
 from cfx.policies.checkpoint import save_agent
+from cfx_sumo.commands import parse_drivers
 from cfx_sumo.demo.motorway import SHIPPED
-from cfx_sumo.drive.run import (
-    Collision,
-    CollisionCounts,
-    ScenarioRun,
-    Tally,
-    command_line,
-    parse_drivers,
-    report,
-)
+from cfx_sumo.drive.printed import report
+from cfx_sumo.drive.sumo_process import command_line
+from cfx_sumo.drive.tally import Collision, CollisionCounts, ScenarioRun, Tally
 from tests.agents import adaptive
 from tests.forks import Forks
 

@@ -117,7 +117,8 @@ import sys
 sys.modules["pyarrow"] = None
 import json
 from pathlib import Path
-from cfx_sumo.drive.run import _Run, started
+from cfx_sumo.drive.run import _Run
+from cfx_sumo.drive.sumo_process import started
 from cfx_sumo.live.driver import Driver
 from cfx_sumo.live.fleet import Fleet
 from cfx_sumo.demo.motorway import SHIPPED

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from cfx_sumo.drive.queue import QueueAtLight
-from cfx_sumo.drive.run import Histogram
+from cfx_sumo.drive.tally import Histogram
 from tests.forks import Forks
 
 pytest.importorskip("traci", reason="needs the extra sumo")
@@ -191,11 +191,11 @@ def test_without_a_window_gui_is_one_sentence(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from cfx.app.cli import main
-    from cfx_sumo.drive import run as driving
+    from cfx_sumo.drive import sumo_process
 
     monkeypatch.setitem(sys.modules, "pyarrow", sys.modules.get("pyarrow"))
     monkeypatch.setitem(sys.modules, "sumo", None)
-    monkeypatch.setattr(driving.shutil, "which", lambda _: None)
+    monkeypatch.setattr(sumo_process.shutil, "which", lambda _: None)
     assert main(["drive", "ring", "--gui"]) == 2
     assert capsys.readouterr().err.strip() == (
         "--gui needs SUMO's window, sumo-gui: pip install eclipse-sumo"

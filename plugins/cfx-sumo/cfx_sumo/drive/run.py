@@ -6,242 +6,38 @@ on.
 
 from __future__ import annotations
 
-import csv
 import math
-import os
-import secrets
-import shutil
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TextIO, Unpack
-from xml.etree import ElementTree
+from typing import Any, NamedTuple, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cfx.errors import ConfigError, DataError, OutputError, SumoError, nearest
-from cfx.plugin import Task, files
+from cfx.errors import DataError, OutputError, SumoError, nearest
+from cfx.plugin import Task
 from cfx_sumo.drive.distributions import members_of
 from cfx_sumo.drive.left_out import left_out
 from cfx_sumo.drive.scenario_report import Observer, ScenarioReport, write_report
 from cfx_sumo.drive.scenarios import SCENARIOS
+from cfx_sumo.drive.sumo_process import command_line, is_set, started
+from cfx_sumo.drive.tally import Collision, CollisionCounts, ScenarioRun, Tally
+from cfx_sumo.drive.vehicle_rows import VehicleRows
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.live.driver import Driver, DriverOptions
 from cfx_sumo.live.fleet import Fleet
 from cfx_sumo.live.histories import WALKING_MPS
 from cfx_sumo.live.surroundings import View, lanes_of
 
-if TYPE_CHECKING:
-    from rich.table import Table
-
 Actor = Callable[[Any], None]
 """Acts on a simulation before each of its steps."""
 
-_QUANTILES = (0.05, 0.5, 0.95)
-"""Quantiles by which live traffic is compared with the recording."""
-
-
-_DECIMALS = 6
-"""Of the output's numbers: micrometres, however far a vehicle is from the origin."""
-
 _LANES_EVERY_S = 0.5
 """s: lanes are looked at no more often, as SUMO has to be asked for each vehicle."""
-
-_LISTED = 10
-"""Collisions, and vehicles left out, that the report lists."""
-
-
-class Histogram:
-    """Counts values in bins of equal width; those beyond the ends count in the last bins.
-
-    Args:
-        low, high: ends.
-        width: of a bin, which is also how exactly quantiles are known.
-    """
-
-    def __init__(self, low: float, high: float, width: float) -> None:
-        self.low, self.width = low, width
-        self.counts = np.zeros(round((high - low) / width), dtype=np.int64)
-
-    def add(self, values: Sequence[float] | np.ndarray) -> None:
-        """Counts values; those that are not finite are left out."""
-        array = np.asarray(values, dtype=np.float64)
-        array = array[np.isfinite(array)]
-        places = ((array - self.low) / self.width).astype(np.int64)
-        last = len(self.counts) - 1
-        self.counts += np.bincount(places.clip(0, last), minlength=last + 1)
-
-    def quantile(self, share: float) -> float:
-        """Returns the value below which this share lies, to half a bin; NaN if there is none."""
-        total = int(self.counts.sum())
-        if total == 0:
-            return float("nan")
-        place = int(np.searchsorted(self.counts.cumsum(), share * total))
-        return self.low + (place + 0.5) * self.width
-
-
-@dataclass
-class Tally:
-    """What the vehicles of one vType did.
-
-    Attributes:
-        vehicles: ids of all that were on the road.
-        steps: vehicle steps.
-        behind: those of them behind a leader; in the others no vehicle was ahead.
-        metres: the distance that all covered together.
-        lane_changes: on the same edge.
-        hard_brakings: times that a vehicle began to brake harder than its vType's `decel`.
-        hardest_braking: the largest deceleration of any, m/s2.
-        braking: decelerations of all steps, m/s2; 0 where a vehicle did not brake.
-        speeds: of all steps, m/s.
-        accelerations: of all steps, m/s2.
-        time_gaps: of the steps behind a leader faster than walking, s.
-        collisions: of those that SUMO reported, the ones with contact (`Collision.contact`) of a
-            vehicle and the one ahead of it.
-        below_min_gap: those in which the gap was below minGap, and nobody was touched.
-        crossings: those of vehicles whose paths cross at a junction.
-        teleports: vehicles that SUMO reported; a vehicle may teleport more than once.
-    """
-
-    vehicles: set[str] = field(default_factory=set)
-    steps: int = 0
-    behind: int = 0
-    metres: float = 0.0
-    lane_changes: int = 0
-    hard_brakings: int = 0
-    hardest_braking: float = 0.0
-    braking: Histogram = field(default_factory=lambda: Histogram(0.0, 20.0, 0.02))
-    speeds: Histogram = field(default_factory=lambda: Histogram(0.0, 70.0, 0.1))
-    accelerations: Histogram = field(default_factory=lambda: Histogram(-15.0, 8.0, 0.02))
-    time_gaps: Histogram = field(default_factory=lambda: Histogram(0.0, 30.0, 0.05))
-    collisions: int = 0
-    below_min_gap: int = 0
-    crossings: int = 0
-    teleports: int = 0
-
-
-@dataclass
-class Collision:
-    """What SUMO reports as a collision of two vehicles, however many steps it lasts.
-
-    SUMO reports a gap below the follower's `minGap` as well (`collision.mingap-factor`).
-
-    Attributes:
-        time: s, of the first step.
-        kind: the driven vType of the collider; of the victim, where no policy drives the collider.
-        collider, victim: their ids.
-        lane: of the collider.
-        position: of the collider's front on it, m.
-        gap: the smallest, from bumper to bumper, m; None: not known, as where paths cross.
-        crossing: whether their paths cross at a junction; otherwise one is behind the other.
-        inserted: whether SUMO has just put the collider there, as it does on an edge that is
-            shorter than a vehicle.
-    """
-
-    time: float
-    kind: str
-    collider: str
-    victim: str
-    lane: str
-    position: float
-    gap: float | None
-    crossing: bool = False
-    inserted: bool = False
-
-    @property
-    def contact(self) -> bool:
-        """Whether they touched; also where the gap is not known."""
-        return self.gap is None or self.gap <= 0.0
-
-    def __str__(self) -> str:
-        """Returns who, where and when on one line."""
-        if self.crossing:
-            return (
-                f"{self.time:.2f} s: {self.collider} and {self.victim}, whose paths cross, on"
-                f" {self.lane} at {self.position:.1f} m"
-            )
-        what = "contact"
-        if not self.contact:
-            what = "below minGap"
-        gap = "gap not known"
-        if self.gap is not None:
-            gap = f"gap {self.gap:.2f} m"
-        where = ", where SUMO has just inserted it" if self.inserted else ""
-        return (
-            f"{self.time:.2f} s: {self.collider} behind {self.victim} on {self.lane} at"
-            f" {self.position:.1f} m{where}: {what}, {gap}"
-        )
-
-
-class CollisionCounts(NamedTuple):
-    """How many collisions there were with contact.
-
-    Attributes:
-        behind: of a vehicle and the one ahead of it.
-        crossing: of vehicles whose paths cross at a junction.
-    """
-
-    behind: int
-    crossing: int
-
-    def __str__(self) -> str:
-        """Returns both in words."""
-        return f"{self.behind} with the vehicle ahead, {self.crossing} where paths cross"
-
-
-@dataclass(frozen=True)
-class ScenarioRun:
-    """What `run_scenario` reports.
-
-    Attributes:
-        tallies: for each vType that was driven.
-        steps: of the simulation.
-        dt: its time step, s.
-        seconds: how long it took.
-        others: most vehicles of other types at one time.
-        most: most vehicles of the driven types at one time.
-        limited: for each vType, the share of the model's steps behind a leader that are at a limit
-            of acceleration.
-        changed: for each vType, the share of the speeds that SUMO's checks changed.
-        outside: for each vType, how much was driven outside what its policy has learned, in words;
-            "" where nothing was.
-        recorded: for each vType, quantiles of the recording that its policy learned from, by
-            signal (`Agent.recorded`).
-        expected: for each vType, what error of speed to expect of its policy, in words; "" where
-            that is not known.
-        collisions: that SUMO reported of driven vehicles, in their order.
-        collisions_of_sumo: how many SUMO has in the same scenario where its own models drive all;
-            None where there was nothing to compare with them.
-        left_out: what SUMO says of the vehicles and flows of the scenario that it left out.
-        fleets: for each vType, in words, who drives its vehicles.
-    """
-
-    tallies: Mapping[str, Tally]
-    steps: int
-    dt: float
-    seconds: float
-    others: int
-    most: int
-    limited: Mapping[str, float] = field(default_factory=dict)
-    changed: Mapping[str, float] = field(default_factory=dict)
-    outside: Mapping[str, str] = field(default_factory=dict)
-    recorded: Mapping[str, Mapping[str, Sequence[float]]] = field(default_factory=dict)
-    expected: Mapping[str, str] = field(default_factory=dict)
-    collisions: Sequence[Collision] = ()
-    collisions_of_sumo: CollisionCounts | None = None
-    left_out: Sequence[str] = ()
-    fleets: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def real_time(self) -> float:
-        """Simulated seconds per second."""
-        if self.seconds <= 0:
-            return float("inf")
-        return self.steps * self.dt / self.seconds
 
 
 def run_scenario(
@@ -288,15 +84,15 @@ def run_scenario(
         seed = options.get("seed")
         options["seed"] = seed or 0
         fleet = Fleet.load(runs, **options)
-        if step is None and not _is_set(path, sumo_options, "step-length"):
+        if step is None and not is_set(path, sumo_options, "step-length"):
             step = min(driver.policy.dt for driver in fleet.drivers.values())
         command = command_line(path, sumo_options, step=step, seed=seed, gui=gui)
-        if not _is_set(path, sumo_options, "error-log"):
+        if not is_set(path, sumo_options, "error-log"):
             folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="cfx-"))
             command += ["--error-log", str(Path(folder, "warnings.txt"))]
         with started(path, command, gui) as connection:
             log = Path(connection.simulation.getOption("error-log"))
-            rows = _Rows.opened(stack, output, fleet) if output is not None else None
+            rows = VehicleRows.opened(stack, output, fleet) if output is not None else None
             observer = None
             if report_to is not None:
                 observer = Observer()
@@ -423,150 +219,6 @@ def _nobody() -> None:
     """Makes nobody who acts on a simulation besides its drivers."""
 
 
-@contextmanager
-def started(scenario: Path, command: Sequence[str], gui: bool) -> Iterator[Any]:
-    """Starts SUMO for a block; gives its connection.
-
-    Args:
-        scenario: for messages.
-        command: SUMO's command line.
-        gui: whether it is that of SUMO's window.
-
-    Raises:
-        SumoError: a simulation is open in this process, which is left as it is; SUMO refuses the
-            scenario, or stops in the block.
-    """
-    try:
-        sumo = _window(command) if gui else _in_process(command)
-    except Exception as error:
-        if not _is_sumos(error):
-            raise
-        raise SumoError(f"SUMO refuses {scenario}: {_reason(error)}") from error
-    try:
-        yield sumo
-    except Exception as error:
-        if not _is_sumos(error):
-            raise
-        raise SumoError(f"SUMO stopped {scenario}: {_reason(error)}") from error
-    finally:
-        _close(sumo)
-
-
-_QUIET = "LIBSUMO_AS_TRACI"
-
-_CHECK_JUNCTIONS = "--collision.check-junctions"
-
-
-def _in_process(command: Sequence[str]) -> Any:
-    """Starts SUMO in this process; returns libsumo, which has room for one simulation."""
-    before = os.environ.get(_QUIET)
-    # No word about pyarrow, which is not loaded here.
-    os.environ.setdefault(_QUIET, "quiet")
-    try:
-        import libsumo
-    finally:
-        if before is None:
-            del os.environ[_QUIET]
-    if libsumo.isLoaded():
-        raise SumoError(
-            "a simulation is open in this process, and libsumo has room for one; close it first"
-            " (libsumo.close()), or run this in a process of its own"
-        )
-    try:
-        libsumo.start(list(command))
-    except Exception:
-        _close(libsumo)  # what it refuses stays loaded otherwise
-        raise
-    return libsumo
-
-
-def _window(command: Sequence[str]) -> Any:
-    """Starts SUMO's window; returns a connection beside those that the caller may have."""
-    import traci  # type: ignore[import-untyped]  # SUMO brings no types
-
-    label = f"cfx-{secrets.token_hex(4)}"
-    traci.start(list(command), label=label, doSwitch=False)
-    return traci.getConnection(label)
-
-
-def _close(sumo: Any) -> None:
-    try:
-        sumo.close()
-    except Exception as error:  # SUMO has gone already; why was said
-        if not _is_sumos(error):
-            raise
-
-
-def _is_sumos(error: Exception) -> bool:
-    """Says whether an error is SUMO's word; libsumo's and traci's are classes of the same names."""
-    return type(error).__name__ in {"TraCIException", "FatalTraCIError"}
-
-
-def _gui_program() -> str:
-    try:
-        import sumo  # of the wheel eclipse-sumo, which the extra leaves out for its size
-
-        program = shutil.which("sumo-gui", path=str(Path(sumo.__file__).parent / "bin"))
-    except ImportError:
-        program = shutil.which("sumo-gui")
-    if program is None:
-        raise SumoError("--gui needs SUMO's window, sumo-gui: pip install eclipse-sumo")
-    return program
-
-
-def _is_set(scenario: Path, options: Sequence[str], name: str) -> bool:
-    """Says whether SUMO's configuration or the user's own options set one of SUMO's options."""
-    if any(option.partition("=")[0] == f"--{name}" for option in options):
-        return True
-    try:
-        # S314: it is the user's own file, which SUMO reads next.
-        return next(ElementTree.parse(scenario).iter(name), None) is not None  # noqa: S314
-    except ElementTree.ParseError:
-        return True  # SUMO says what is wrong with it
-
-
-def command_line(
-    scenario: Path,
-    options: Sequence[str] = (),
-    *,
-    step: float | None = None,
-    seed: int | None = None,
-    gui: bool = False,
-) -> list[str]:
-    """Returns SUMO's command line; the user's own options come last and win.
-
-    Args:
-        scenario: SUMO's configuration.
-        options: the user's own.
-        step: of the simulation, s; None: the configuration's.
-        seed: SUMO's; None: the configuration's.
-        gui: whether SUMO's window is shown.
-    """
-    command = ["sumo", "-c", str(scenario)]
-    if gui:
-        command[0] = _gui_program()
-        command += ["--start", "--quit-on-end", "--delay", "100"]
-    # SUMO does not look for collisions at junctions unless it is told to.
-    switches = ("--no-step-log", "--duration-log.disable", "--no-warnings", _CHECK_JUNCTIONS)
-    set_by_user = {option.partition("=")[0] for option in options}
-    for name in switches:
-        if name not in set_by_user:
-            command += [name, "true"]
-    if step is not None:
-        command += ["--step-length", f"{step:g}"]
-    if seed is not None:
-        command += ["--seed", str(seed)]
-    return command + list(options)
-
-
-def _reason(error: Exception) -> str:
-    """Returns SUMO's words on one line; some of them it prints on stderr alone."""
-    message = " ".join(str(error).split()).rstrip(".")
-    if message in {"", "Process Error", "Connection closed by SUMO"}:
-        return "its own message stands above"
-    return message
-
-
 class _Motions(NamedTuple):
     """What vehicles of a driver do, `(D,)` each; SI units.
 
@@ -601,7 +253,7 @@ class _Run:
         sumo: Any,
         fleet: Fleet,
         scenario: Path,
-        rows: _Rows | None,
+        rows: VehicleRows | None,
         actor: Actor | None = None,
         title: str = "",
     ) -> None:
@@ -871,201 +523,3 @@ class _Run:
         for name in self._sumo.simulation.getStartingTeleportIDList():
             if name in self._type_of:
                 self._tallies[self._type_of[name]].teleports += 1
-
-
-class _Rows:
-    """The output: a row for each vehicle of the fleet and step, SI units."""
-
-    _COLUMNS = (
-        "time_s",
-        "vehicle",
-        "type",
-        "edge",
-        "lane",
-        "position_m",
-        "x_m",
-        "y_m",
-        "speed_mps",
-        "acceleration_mps2",
-    )
-
-    def __init__(self, file: TextIO, parameters: Sequence[str]) -> None:
-        self._writer = csv.writer(file)
-        self._parameters = list(parameters)
-        self._writer.writerow([*self._COLUMNS, *(f"parameter_{name}" for name in parameters)])
-
-    @classmethod
-    def opened(cls, stack: ExitStack, path: Path, fleet: Fleet) -> _Rows:
-        """Opens the file, which takes its name when the run has ended well."""
-        if path.is_dir():
-            raise OutputError(f"{path} is a folder; name a file in --output")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            partial = stack.enter_context(files.atomic_write(path))
-            file = stack.enter_context(partial.open("w", newline="", encoding="utf-8"))
-        except OSError as error:
-            raise OutputError(
-                f"{path} cannot be written ({error.strerror}); name another --output"
-            ) from error
-        names: dict[str, None] = {}
-        for driver in fleet.drivers.values():
-            names |= dict.fromkeys(driver.policy.space.names)
-        return cls(file, list(names))
-
-    def write(self, sumo: Any, fleet: Fleet) -> None:
-        """Writes where the fleet's vehicles are, and the parameters with which they drive on."""
-        for name, kind in fleet.vehicles.items():
-            self._writer.writerow(self._row(sumo, name, kind, fleet.drivers[kind].parameters(name)))
-
-    def _row(self, sumo: Any, name: str, kind: str, parameters: Mapping[str, float]) -> list[str]:
-        vehicle = sumo.vehicle
-        lane = [vehicle.getRoadID(name), str(vehicle.getLaneIndex(name))]
-        x, y = vehicle.getPosition(name)
-        speed, acceleration = vehicle.getSpeed(name), vehicle.getAcceleration(name)
-        row = [f"{sumo.simulation.getTime():.10g}", name, kind, *lane]
-        for value in (vehicle.getLanePosition(name), x, y, speed, acceleration):
-            row.append(repr(round(value, _DECIMALS)))
-        for parameter in self._parameters:
-            value = parameters.get(parameter)
-            row.append("" if value is None else repr(round(value, _DECIMALS)))
-        return row
-
-
-def parse_drivers(arguments: Sequence[str]) -> dict[str, str]:
-    """Reads `TYPE=RUN` arguments.
-
-    Raises:
-        ConfigError: one is not of this form, or names a vType twice.
-    """
-    runs: dict[str, str] = {}
-    for argument in arguments:
-        name, equals, run = argument.partition("=")
-        if not (name and equals and run):
-            raise ConfigError(
-                f"--drivers {argument}: write TYPE=RUN, a vType of the scenario and a job's output"
-                " folder or a ready-made policy, such as car=cfx://idm"
-            )
-        if name in runs:
-            raise ConfigError(f"--drivers: vType '{name}' stands twice")
-        runs[name] = run
-    return runs
-
-
-def report(run: ScenarioRun) -> None:
-    """Prints what happened: tables, and one line about speed."""
-    from cfx.plugin import console
-
-    console.print_table(_what_happened(run))
-    console.print_table(_braking(run))
-    console.print_table(_beside_the_recording(run))
-    for collision in run.collisions[:_LISTED]:
-        print(collision)
-    if len(run.collisions) > _LISTED:
-        print(f"... and {len(run.collisions) - _LISTED} more collisions")
-    if any(not collision.contact for collision in run.collisions):
-        print(
-            "SUMO takes a gap below minGap for a collision, and teleports the vehicle unless the"
-            " scenario says otherwise; -- --collision.mingap-factor 0 leaves contact alone"
-        )
-    for sentence in run.left_out[:_LISTED]:
-        print(f"left out by SUMO: {sentence}")
-    if len(run.left_out) > _LISTED:
-        print(f"... and {len(run.left_out) - _LISTED} more vehicles and flows left out")
-    if run.collisions_of_sumo is not None:
-        behind = sum(tally.collisions for tally in run.tallies.values())
-        crossings = sum(tally.crossings for tally in run.tallies.values())
-        print(
-            f"Collisions: {CollisionCounts(behind, crossings)}; where SUMO's own models drive all"
-            f" of them in the same scenario: {run.collisions_of_sumo}"
-        )
-    for name, words in run.fleets.items():
-        print(f"{name}: {words}")
-    for name, words in run.expected.items():
-        if words:
-            print(f"{name}: {words}")
-    for name, words in run.outside.items():
-        if words:
-            print(f"{name}: {words}; there it fades towards its base parameters")
-    print(
-        f"{run.steps} steps of {run.dt:g} s in {run.seconds:.1f} s, {run.real_time:.1f} times real"
-        f" time; at most {run.most} of these vehicles at once, {run.others} others"
-    )
-
-
-def _what_happened(run: ScenarioRun) -> Table:
-    table = _table(
-        "vType",
-        "vehicles",
-        "behind a leader",
-        "mean speed [m/s]",
-        "lane changes",
-        "collisions",
-        "below minGap",
-        "crossing paths",
-        "teleports",
-    )
-    for name, tally in run.tallies.items():
-        table.add_row(
-            name,
-            str(len(tally.vehicles)),
-            f"{tally.behind / tally.steps:.0%}",
-            f"{tally.metres / (tally.steps * run.dt):.2f}",
-            str(tally.lane_changes),
-            str(tally.collisions),
-            str(tally.below_min_gap),
-            str(tally.crossings),
-            str(tally.teleports),
-        )
-    return table
-
-
-def _braking(run: ScenarioRun) -> Table:
-    """Returns how hard vehicles braked, m/s2."""
-    table = _table(
-        "braking [m/s2]",
-        "95 % of steps below",
-        "99.9 % below",
-        "hardest",
-        "times above decel",
-        "steps at limits",
-        "changed by SUMO",
-    )
-    for name, tally in run.tallies.items():
-        table.add_row(
-            name,
-            f"{tally.braking.quantile(0.95):.2f}",
-            f"{tally.braking.quantile(0.999):.2f}",
-            f"{tally.hardest_braking:.2f}",
-            str(tally.hard_brakings),
-            f"{run.limited.get(name, 0.0):.1%}",
-            f"{run.changed.get(name, 0.0):.1%}",
-        )
-    return table
-
-
-def _beside_the_recording(run: ScenarioRun) -> Table:
-    """Returns quantiles of the live vehicles beside those of what their policy learned from."""
-    table = _table("5 %, median, 95 %", "speed [m/s]", "acceleration [m/s2]", "time gap [s]")
-    for name, tally in run.tallies.items():
-        live = []
-        for histogram in (tally.speeds, tally.accelerations, tally.time_gaps):
-            live.append(_listed([histogram.quantile(share) for share in _QUANTILES]))
-        table.add_row(name, *live)
-        recorded = run.recorded.get(name) or {}
-        if recorded:
-            signals = ("speed", "acceleration", "time_gap")
-            table.add_row("its recording", *(_listed(recorded[signal]) for signal in signals))
-    return table
-
-
-def _table(*columns: str) -> Table:
-    from cfx.plugin import console
-
-    table = console.blank_table(*columns)
-    for column in table.columns[1:]:
-        column.justify = "right"
-    return table
-
-
-def _listed(values: Sequence[float]) -> str:
-    return ", ".join(f"{value:.2f}" for value in values)

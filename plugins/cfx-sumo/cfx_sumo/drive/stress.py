@@ -19,8 +19,8 @@ import numpy as np
 from cfx.errors import SumoError
 from cfx.plugin import Task, files
 from cfx_sumo.drive.queue import SECONDS, QueueAtLight, queue_of
-from cfx_sumo.drive.run import command_line, started
 from cfx_sumo.drive.scenarios import ASSETS, CAR, SCENARIOS, STEP_S, Scenario
+from cfx_sumo.drive.sumo_process import command_line, started
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.live.driver import OBEYS_ALL
 from cfx_sumo.live.fleet import Fleet

@@ -24,8 +24,8 @@ from rich.text import Text
 from cfx.errors import NotInstalledError, OutputError, SumoError
 from cfx.plugin import Task, files, traffic
 from cfx_sumo.drive.queue import SECONDS, QueueAtLight, queue_of
-from cfx_sumo.drive.run import command_line, started
 from cfx_sumo.drive.scenarios import ASSETS, CAR, SCENARIOS, Scenario
+from cfx_sumo.drive.sumo_process import command_line, started
 from cfx_sumo.installed import require_sumo
 from cfx_sumo.live.fleet import Fleet
 from cfx_sumo.live.policies import load_policy

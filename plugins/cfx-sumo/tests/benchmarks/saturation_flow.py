@@ -17,7 +17,7 @@ import sys, tempfile
 sys.modules["pyarrow"] = None
 from pathlib import Path
 from cfx_sumo.drive.queue import SECONDS, QueueAtLight, queue_of
-from cfx_sumo.drive.run import command_line, started
+from cfx_sumo.drive.sumo_process import command_line, started
 queue = QueueAtLight()
 with tempfile.TemporaryDirectory() as folder:
     scenario = queue_of(sys.argv[1]).write(Path(folder))
