@@ -17,7 +17,7 @@ from cfx.data.style import CLUSTERS
 from cfx.evaluation.result import Evaluation, Purpose
 from cfx.evaluation.statistics import Improvement, improvement_statistics
 from cfx.evaluation.tables import values_of
-from cfx.results.tables import history_metrics
+from cfx.results.tables.history import history_metrics
 from tests.made_up import GAINS, TWO, info, make_history, make_platoon, make_results, with_metric
 
 WITHIN = ("default", "driver_specific", "policy")

@@ -10,7 +10,7 @@ from rich.text import Text
 
 import cfx
 from cfx.errors import PluginError
-from cfx.results.tables import KnownParameters
+from cfx.results.tables.known_parameters import KnownParameters
 from tests.installer import Installer
 
 QUICK = [

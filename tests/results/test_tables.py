@@ -19,7 +19,7 @@ from cfx.results.table import (
     parts_of,
     stored_tables,
 )
-from cfx.results.tables import History
+from cfx.results.tables.history import History
 from tests.checkout import ROOT
 from tests.made_up import GAINS, make_history, make_results
 

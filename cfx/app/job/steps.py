@@ -51,7 +51,7 @@ from cfx.policies.ready import is_ready_made
 from cfx.results.config import JobConfig
 from cfx.results.provenance import commit, distributions, version
 from cfx.results.result import Result
-from cfx.results.tables import noise_evidence
+from cfx.results.tables.known_parameters import noise_evidence
 from cfx.results.tracker import folder_of, is_run_id
 from cfx.simulation.base import Simulator
 from cfx.simulation.rollout import MemorySimulator, MemoryStepper
@@ -76,7 +76,7 @@ def calibration_tables(
 
     Returns:
         slices: see `cfx.calibration.identifiability.slices`.
-        fits: see `cfx.results.tables.Fits`; with a posterior it has `DriverPosteriors.columns`.
+        fits: see `cfx.results.tables.fits.Fits`; with a posterior it has `DriverPosteriors.columns`.
         Further ones with a posterior, see `DriverPosteriors.tables`.
     """
     calibrated = "driver_specific" in evaluation.methods and bool(evaluation.names)

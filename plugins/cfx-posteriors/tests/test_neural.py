@@ -14,7 +14,7 @@ import cfx
 from cfx.calibration.posterior import posterior_method
 from cfx.errors import NotInstalledError
 from cfx.models.krauss import Krauss
-from cfx.results.tables import KnownParameters
+from cfx.results.tables.known_parameters import KnownParameters
 from cfx_posteriors.importance import sample
 from cfx_posteriors.laplace import laplace, likely_starts
 from tests.test_job_posterior import QUICK

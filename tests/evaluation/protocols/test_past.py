@@ -25,7 +25,7 @@ from cfx.policies.agent import Agent
 from cfx.policies.checkpoint import load_agent
 from cfx.policies.known_drivers import driver_features_of, unlikeness
 from cfx.policies.ready import folder_of_ready_made
-from cfx.results.tables import Past
+from cfx.results.tables.past import Past
 from tests.drives import straight_pairs
 
 QUICK = [
