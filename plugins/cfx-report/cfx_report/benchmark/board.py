@@ -14,7 +14,7 @@ import pandas as pd
 from cfx.errors import DataError
 from cfx.plugin import files, statistics
 from cfx_report.benchmark.compare import read_errors
-from cfx_report.benchmark.entries import folder_of
+from cfx_report.benchmark.entries import folder_of, without_seed
 from cfx_report.benchmark.i80 import I80
 from cfx_report.benchmark.roads import QUICK, ROADS
 from cfx_report.benchmark.row import PAIRS, ROW, Row
@@ -81,7 +81,8 @@ class Standing:
         table: a row each, the best score first: `score` (by which share errors are smaller than the
             baseline's, geometric, each site counts once), `low`, `high`, and means over sites.
         sites: mean error of each row at each site.
-        verdict: who is closest to the drivers, and whether it is chance.
+        verdict: who is closest to the drivers, and whether it is chance; a method with rows of
+            several seeds counts once, with the mean of each pair's errors.
         unit: of the error.
     """
 
@@ -213,9 +214,14 @@ def _standing(
         sites[name] = judged.groupby("site", sort=False)["error"].mean()
     table = pd.DataFrame(lines).sort_values("score", ascending=False, ignore_index=True)
     site_of = dict(zip(baseline.index, baseline["site"], strict=True))
-    ranking = statistics.ranking_of({name: [pairs] for name, pairs in errors.items()}, site_of)
+    of_seeds: dict[str, list[pd.DataFrame]] = {}
+    for name, judged in errors.items():
+        of_seeds.setdefault(without_seed(name), []).append(judged)
+    verdict = statistics.verdict(statistics.ranking_of(of_seeds, site_of))
+    if verdict and len(of_seeds) < len(errors):
+        verdict += " Of rows with several seeds it takes the mean of each pair's errors."
     by_site = pd.DataFrame(sites).T.reindex(table["row"])
-    return Standing(task, table, by_site, statistics.verdict(ranking))
+    return Standing(task, table, by_site, verdict)
 
 
 def _values(suite: Suite, task: Task, errors: pd.DataFrame) -> dict[str, object]:

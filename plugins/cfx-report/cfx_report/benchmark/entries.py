@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, cast
@@ -29,6 +30,14 @@ from cfx_report.benchmark.methods import (
 from cfx_report.benchmark.rival import Rival
 from cfx_report.benchmark.suite import Suite
 
+_SEED = ", seed "
+"""Stands in a row's name before a seed of training that is not 0."""
+
+
+def without_seed(row: str) -> str:
+    """Returns the name that rows of one method have in common, whatever their seed."""
+    return re.sub(rf"{_SEED}\d+$", "", row)
+
 
 def entry_of(method: str | None, overrides: Sequence[str], name: str | None, seed: int) -> Entry:
     """Returns what enters.
@@ -44,7 +53,7 @@ def entry_of(method: str | None, overrides: Sequence[str], name: str | None, see
     Raises:
         ConfigError: an override changes what is frozen, or there is no such rival.
     """
-    suffix = f", seed {seed}" if seed else ""
+    suffix = f"{_SEED}{seed}" if seed else ""
     if any(word.partition("=")[0] == "rival" for word in overrides):
         if method is not None:
             raise ConfigError("--method says how a model of cfx is used; a rival has none")

@@ -320,6 +320,21 @@ def test_scores_are_relative_to_the_baseline(rows: list[Path]) -> None:
         standings(entered[1:])
 
 
+def test_seeds_of_one_method_are_no_rivals(rows: list[Path]) -> None:
+    """A seed with twice the errors stands in its row alone; the verdict takes their mean."""
+    keeps, late = (Entered.read(folder) for folder in rows)
+    numbers = ["rmse_speed", "crps_speed"]
+    doubled = late.errors.assign(**{name: 2 * late.errors[name] for name in numbers})
+    meant = late.errors.assign(**{name: 1.5 * late.errors[name] for name in numbers})
+    seed = replace(late, row=replace(late.row, name="late, seed 1"), errors=doubled)
+    mean = replace(late, errors=meant)
+    for two, one in zip(standings([keeps, late, seed]), standings([keeps, mean]), strict=True):
+        assert set(two.table["row"]) == {"keeps", "late", "late, seed 1"}
+        verdict, _, seeds = two.verdict.partition(" Of rows with several seeds")
+        assert seeds
+        assert verdict == one.verdict
+
+
 def test_standings_are_written_with_what_tables_leave_out(rows: list[Path], tmp_path: Path) -> None:
     entered = [Entered.read(folder) for folder in rows]
     write_standings(entered, tmp_path / "rows.json")
