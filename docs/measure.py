@@ -62,22 +62,9 @@ JOBS = {
     "main-2": Job("IDM", "seed=2"),
     "paper-krauss": Job("Krauss, the paper's training", f"{PAPER} model=krauss {RECONSTRUCTED}"),
     "paper-w99": Job("Wiedemann 99, the paper's training", f"{PAPER} model=w99 {RECONSTRUCTED}"),
-    **{
-        f"clusters-{model}-{cluster}": Job(
-            f"{name}, {cluster}",
-            "experiment=paper/clusters hydra.mode=RUN"
-            f" model={model} style.cluster={cluster} {RECONSTRUCTED}",
-        )
-        for model, name in {"krauss": "Krauss", "w99": "Wiedemann 99"}.items()
-        for cluster in ("conservative", "normal", "aggressive")
-    },
     "pairs-krauss": Job(
         "Krauss, cfx's imitation",
         f"experiment=pairs hydra.mode=RUN model=krauss {RECONSTRUCTED} data.min_duration=70",
-    ),
-    "pairs-w99": Job(
-        "Wiedemann 99, cfx's imitation",
-        f"experiment=pairs hydra.mode=RUN model=w99 {RECONSTRUCTED} data.min_duration=70",
     ),
     "adaptive-krauss": Job(
         "Krauss, with history (`adaptive`)",
@@ -170,7 +157,6 @@ JOBS = {
     "stochastic-krauss": Job(
         "Krauss", f"experiment=stochastic model=krauss learner.drivers=32 {I80}"
     ),
-    "stochastic-w99": Job("Wiedemann 99", f"experiment=stochastic model=w99 {I80}"),
     "stochastic-idm-0500": Job(
         "IDM, 5:00 pm",
         "experiment=stochastic model=idm learner.drivers=32"
