@@ -62,10 +62,6 @@ JOBS = {
     "main-2": Job("IDM", "seed=2"),
     "paper-krauss": Job("Krauss, the paper's training", f"{PAPER} model=krauss {RECONSTRUCTED}"),
     "paper-w99": Job("Wiedemann 99, the paper's training", f"{PAPER} model=w99 {RECONSTRUCTED}"),
-    "pairs-krauss": Job(
-        "Krauss, cfx's imitation",
-        f"experiment=pairs hydra.mode=RUN model=krauss {RECONSTRUCTED} data.min_duration=70",
-    ),
     "adaptive-krauss": Job(
         "Krauss, with history (`adaptive`)",
         "experiment=adaptive hydra.mode=RUN model=krauss learner=rollout"
@@ -163,7 +159,7 @@ JOBS = {
         f" {RECONSTRUCTED} data.recording=i80-0500 {LONG}",
     ),
     "forecast-0400": Job(
-        "at 4:00 pm",
+        "IDM at 4:00 pm, learned at 5:00 pm",
         f"protocol=forecast protocol.run={FOLDER}/stochastic-idm-0500 protocol.samples=50"
         f" {KEPT_BACK}",
     ),

@@ -298,15 +298,17 @@ def forecasts(metric: str, *keys: str) -> list[str]:
 
     Args:
         metric: one of `FORECAST_ERRORS`.
-        keys: jobs; `KEY/METHOD` is another method of a job than its policy.
+        keys: jobs; `KEY/METHOD` is a method of a job, which stands with the job's name where
+            methods of several jobs do.
     """
     group, form = FORECAST_ERRORS[metric]
+    of_several = len({key.partition("/")[0] for key in keys if "/" in key}) > 1
     rows = []
     for key in keys:
         job, _, method = key.partition("/")
         label = job_of(job)["what"]
         if method:
-            label = FORECASTERS[method]
+            label = f"{label}: {FORECASTERS[method]}" if of_several else FORECASTERS[method]
         cells = []
         for horizon in HORIZONS:
             value = numbers_of(job)[f"{group}/{metric}_{horizon}s/{method or 'policy'}"]
