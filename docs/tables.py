@@ -298,16 +298,17 @@ def forecasts(metric: str, *keys: str) -> list[str]:
 
     Args:
         metric: one of `FORECAST_ERRORS`.
-        keys: jobs; `KEY/METHOD` is a method of a job, which stands with the job's name where
-            methods of several jobs do.
+        keys: jobs; `KEY/METHOD` is a method of a job, which stands with the job's name where that
+            of another job does too.
     """
     group, form = FORECAST_ERRORS[metric]
-    of_several = len({key.partition("/")[0] for key in keys if "/" in key}) > 1
+    methods = [key.partition("/")[2] for key in keys]
     rows = []
     for key in keys:
         job, _, method = key.partition("/")
         label = job_of(job)["what"]
         if method:
+            of_several = methods.count(method) > 1
             label = f"{label}: {FORECASTERS[method]}" if of_several else FORECASTERS[method]
         cells = []
         for horizon in HORIZONS:
