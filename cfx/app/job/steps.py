@@ -76,7 +76,8 @@ def calibration_tables(
 
     Returns:
         slices: see `cfx.calibration.identifiability.slices`.
-        fits: see `cfx.results.tables.fits.Fits`; with a posterior it has `DriverPosteriors.columns`.
+        fits: see `cfx.results.tables.fits.Fits`; with a posterior it has
+            `DriverPosteriors.columns`.
         Further ones with a posterior, see `DriverPosteriors.tables`.
     """
     calibrated = "driver_specific" in evaluation.methods and bool(evaluation.names)
