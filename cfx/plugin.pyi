@@ -166,7 +166,11 @@ from .policies.known_drivers import (
     driver_features_of as driver_features_of,
 )
 from .policies.row_choice import DriverRows as DriverRows, RowChoice as RowChoice
-from .policies.ready import READY_FOLDER as READY_FOLDER, traffic_table as traffic_table
+from .policies.ready import (
+    READY_FOLDER as READY_FOLDER,
+    is_ready_made as is_ready_made,
+    traffic_table as traffic_table,
+)
 
 # Learners
 from .learners.base import (

@@ -143,7 +143,7 @@ def forecast(
                 " a stochastic one: cfx.train(pairs, for_='stochastic')"
             )
         origins = _origins(context, at)
-        frames = round(_seconds("horizon", horizon) / context.batch.dt)
+        frames = round(_seconds("horizon", horizon, "a duration") / context.batch.dt)
         if frames < 1:
             raise ConfigError(f"horizon={horizon}: give one step of {context.batch.dt:g} s or more")
         generators: list[torch.Generator | None] = []
@@ -176,7 +176,7 @@ def _origins(context: ProtocolContext, at: float) -> Origins:
     from cfx.evaluation.forecasts import Origins
 
     batch = context.batch
-    frame = round(_seconds("at", at) / batch.dt)
+    frame = round(_seconds("at", at, "a moment") / batch.dt)
     for pair in context.pairs:
         if not 1 <= frame < len(pair) - 1:
             raise ConfigError(
@@ -187,15 +187,20 @@ def _origins(context: ProtocolContext, at: float) -> Origins:
     return Origins(everyone, torch.full_like(everyone, frame))
 
 
-def _seconds(name: str, value: Any) -> float:
+def _seconds(name: str, value: Any, what: str) -> float:
     """Returns a number of seconds.
+
+    Args:
+        name: of the argument.
+        value: that was given.
+        what: it is, for the message.
 
     Raises:
         ConfigError: it is no finite number.
     """
     if isinstance(value, Real) and math.isfinite(value):
         return float(value)
-    raise ConfigError(f"{name}={value}: give a moment in seconds")
+    raise ConfigError(f"{name}={value}: give {what} in seconds")
 
 
 def _tables(

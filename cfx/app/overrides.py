@@ -24,15 +24,13 @@ def override(key: str, value: Any) -> str:
     """
     try:
         return f"{key}={_text(value)}"
-    except TypeError:
-        given, advice = f"a {type(value).__name__}", ""
-        if isinstance(value, type):
-            given = f"the class {value.__name__}"
+    except TypeError as error:
+        advice = ""
         if key == "model":
             advice = "; a class of yours gets a name by @cfx.model(NAME)"
         raise ConfigError(
             f"{key}: a setting is a text, a number, None, or a list or mapping of these, not"
-            f" {given}{advice}"
+            f" {error}{advice}"
         ) from None
 
 
@@ -118,7 +116,7 @@ def _text(value: Any) -> str:
     """Returns a value in Hydra's grammar.
 
     Raises:
-        TypeError: a configuration cannot hold it.
+        TypeError: a configuration cannot hold it; the message says what it is.
     """
     if hasattr(value, "tolist"):  # a number or an array of NumPy's, a series, a tensor
         value = value.tolist()
@@ -139,4 +137,7 @@ def _text(value: Any) -> str:
         return {None: "null", True: "true", False: "false"}[value]
     if isinstance(value, int | float):
         return repr(value)
-    raise TypeError
+    # Of what stands within a list or a mapping, it is the item that is named.
+    raise TypeError(
+        f"the class {value.__name__}" if isinstance(value, type) else f"a {type(value).__name__}"
+    )

@@ -408,6 +408,8 @@ def test_a_wrong_setting_is_answered_as_on_the_command_line(pairs: cfx.Pairs) ->
         cfx.train(pairs, cfx.Pairs)  # type: ignore[arg-type]  # what is tested
     with pytest.raises(ConfigError, match=r"split: a setting is a text, .*, not a set"):
         cfx.calibrate(pairs, split={0.5})
+    with pytest.raises(ConfigError, match=r"metrics: a setting is a text, .*, not a set"):
+        cfx.calibrate(pairs, metrics=[{"jerk"}])
 
 
 TEXTS = ("idm", "1", "true", "null", "", "a b", "it's", "a=b", "x: y", r"c:\d")

@@ -176,7 +176,7 @@ def test_a_forecast_refuses_what_it_cannot_do(others: cfx.Pairs) -> None:
         cfx.forecast("cfx://idm", others, at=40.0)
     with pytest.raises(ConfigError, match="at=nan: give a moment"):
         cfx.forecast("cfx://idm", others, at=float("nan"))
-    with pytest.raises(ConfigError, match="horizon=10 s: give a moment in seconds"):
+    with pytest.raises(ConfigError, match="horizon=10 s: give a duration in seconds"):
         cfx.forecast("cfx://idm", others, at=10.0, horizon="10 s")  # type: ignore[arg-type]  # what is tested
     for key in ("model", "policy.hidden_size", "windows"):
         with pytest.raises(ConfigError, match=f"{key}: the policy brings its model"):

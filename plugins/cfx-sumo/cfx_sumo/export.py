@@ -17,7 +17,6 @@ from torch import Tensor
 from cfx.errors import ConfigError, DataError, listed
 from cfx.plugin import (
     COARSE_S,
-    READY_FOLDER,
     DrivingModel,
     ExportFormat,
     InSumo,
@@ -25,6 +24,7 @@ from cfx.plugin import (
     files,
     folder_of,
     identifiability,
+    is_ready_made,
     job_folder,
     registry,
 )
@@ -71,6 +71,11 @@ def export(run: str | Path, output: str | Path | None = None) -> list[str]:
     Returns:
         Sentences for the user.
     """
+    if is_ready_made(run):
+        raise DataError(
+            f"{run}: a ready-made policy has no driver-specific parameters; export a job that"
+            " calibrated some, or drive with the policy itself (cfx drive)"
+        )
     folder, home = _folder(run)
     node, table = _read(folder)
     kind, notes = vtypes(node, table)
@@ -175,16 +180,7 @@ def _folder(run: str | Path) -> tuple[Path, Path]:
 
 
 def _read(folder: Path) -> tuple[dict[str, Any], pd.DataFrame]:
-    """Reads the model's node, and the rows of `driver_specific`, calmest cluster first.
-
-    Raises:
-        DataError: there is no finished job, or it has no driver-specific parameters.
-    """
-    if READY_FOLDER in folder.parents:
-        raise DataError(
-            f"cfx://{folder.name}: a ready-made policy has no driver-specific parameters; export a"
-            " job that calibrated some, or drive with the policy itself (cfx drive)"
-        )
+    """Reads the model's node, and the rows of `driver_specific`, calmest cluster first."""
     job_folder.examine(folder)
     try:
         node = job_folder.parse_yaml((folder / "config.yaml").read_text(encoding="utf-8"))["model"]
